@@ -1,0 +1,46 @@
+# make help lists what there is. Every target does what it needs first, so any of them works in a fresh clone.
+SHELL := /bin/bash
+.SHELLFLAGS := -euo pipefail -c
+.DEFAULT_GOAL := help
+
+CARGO ?= cargo
+# The versions in Cargo.lock, exactly.
+CARGO_FLAGS ?= --locked
+# For the learner, on top of what `make train` gives it.
+ARGS ?=
+
+# Another libtorch of the user's would be compiled against but not found at run time.
+unexport LIBTORCH LIBTORCH_INCLUDE LIBTORCH_LIB LIBTORCH_STATIC LIBTORCH_USE_PYTORCH
+
+.PHONY: help setup build train test lint bench clean
+
+help: ## this list
+	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "make %-8s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
+
+setup: ## fetch libtorch into the user's cache and link it here
+	@deploy/setup.sh
+
+build: setup ## release binaries: target/release/learner and target/release/actor
+	$(CARGO) build $(CARGO_FLAGS) --release -p popgym-learner -p popgym-actor
+
+train: build ## train until the agent has mastered its task; more options with ARGS="..."
+	target/release/learner train --stop-at-mmer 0.95 $(ARGS)
+
+test: setup ## all tests
+	$(CARGO) test $(CARGO_FLAGS) --workspace
+
+lint: setup ## formatting, clippy, and licences and advisories where cargo-deny is installed
+	$(CARGO) fmt --all --check
+	$(CARGO) clippy $(CARGO_FLAGS) --workspace --all-targets -- -D warnings
+	@if $(CARGO) deny --version >/dev/null 2>&1; then \
+		$(CARGO) deny check; \
+	else \
+		echo "skipped: cargo deny check (cargo-deny is not installed)"; \
+	fi
+
+bench: setup ## all benchmarks
+	$(CARGO) bench $(CARGO_FLAGS) --workspace
+
+clean: ## remove what was built here; the cached libtorch stays
+	$(CARGO) clean
+	rm -f .libtorch

@@ -1,0 +1,331 @@
+//! Spaces: what an observation, an action or a hidden state may be.
+//!
+//! A point of any space is stored in two flat parts, in the order of the space's leaves: one byte for each discrete
+//! component and one `f32` for each real one. Slabs, wires and tensors carry these bytes; one-hot vectors are made
+//! only where a network reads them ([`Space::flatten_into`]).
+
+use std::convert::Infallible;
+
+use serde::{Deserialize, Serialize};
+
+use crate::rng::{EpisodeRng, below, uniform};
+
+/// Largest number of classes of one discrete component: a class is stored in one byte.
+pub const MAX_CLASSES: u16 = 256;
+
+/// A set of values, in the sense of Gymnasium's spaces.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub enum Space {
+    /// One of `0..n`.
+    Discrete(u16),
+    /// A vector of discrete components, component `i` one of `0..n[i]`.
+    MultiDiscrete(Vec<u16>),
+    /// A vector of reals, component `i` within `low[i]..=high[i]` (bounds may be infinite).
+    Box {
+        /// Lower bounds, one a component.
+        low: Vec<f32>,
+        /// Upper bounds, one a component.
+        high: Vec<f32>,
+    },
+    /// A sequence of spaces.
+    Tuple(Vec<Space>),
+}
+
+/// One component of a space, in order.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Leaf {
+    /// A class in `0..classes`.
+    Discrete {
+        /// Number of classes.
+        classes: u16,
+    },
+    /// A real within `low..=high`.
+    Real {
+        /// Lower bound.
+        low: f32,
+        /// Upper bound.
+        high: f32,
+    },
+}
+
+/// Why a value is not a point of a space.
+#[derive(Clone, Debug, PartialEq, thiserror::Error)]
+pub enum SpaceError {
+    /// Wrong number of discrete or real components.
+    #[error("expected {expected_discrete} discrete and {expected_real} real components, got {discrete} and {real}")]
+    Width {
+        /// Discrete components of the space.
+        expected_discrete: usize,
+        /// Real components of the space.
+        expected_real: usize,
+        /// Discrete components given.
+        discrete: usize,
+        /// Real components given.
+        real: usize,
+    },
+    /// A class outside its range.
+    #[error("discrete component {index} is {value}, allowed is 0..{classes}")]
+    Class {
+        /// Index among the discrete components.
+        index: usize,
+        /// The class given.
+        value: u8,
+        /// Number of classes.
+        classes: u16,
+    },
+    /// A real that is not finite or is out of bounds.
+    #[error("real component {index} is {value}, allowed is {low}..={high}")]
+    Real {
+        /// Index among the real components.
+        index: usize,
+        /// The value given.
+        value: f32,
+        /// Lower bound.
+        low: f32,
+        /// Upper bound.
+        high: f32,
+    },
+}
+
+/// A borrowed point of a space.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Value<'a> {
+    /// Classes of the discrete components.
+    pub discrete: &'a [u8],
+    /// The real components.
+    pub real: &'a [f32],
+}
+
+/// A borrowed point of a space, to be written.
+#[derive(Debug, Default)]
+pub struct ValueMut<'a> {
+    /// Classes of the discrete components.
+    pub discrete: &'a mut [u8],
+    /// The real components.
+    pub real: &'a mut [f32],
+}
+
+/// Many points of one space, row after row: the storage that callers own and environments write into.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Slab {
+    discrete_width: usize,
+    real_width: usize,
+    /// `[rows, discrete_width]` classes, row-major.
+    pub discrete: Vec<u8>,
+    /// `[rows, real_width]` reals, row-major.
+    pub real: Vec<f32>,
+}
+
+impl Space {
+    /// An unbounded or bounded vector of `n` reals, all with the same bounds.
+    pub fn uniform_box(n: usize, low: f32, high: f32) -> Self {
+        Self::Box { low: vec![low; n], high: vec![high; n] }
+    }
+
+    /// Calls `visit` with each component in order, until it fails. Does not allocate.
+    ///
+    /// # Errors
+    /// The first error of `visit`.
+    pub fn try_for_each_leaf<E>(&self, visit: &mut impl FnMut(Leaf) -> Result<(), E>) -> Result<(), E> {
+        match self {
+            Self::Discrete(classes) => visit(Leaf::Discrete { classes: *classes }),
+            Self::MultiDiscrete(n) => n.iter().try_for_each(|&classes| visit(Leaf::Discrete { classes })),
+            Self::Box { low, high } => {
+                low.iter().zip(high).try_for_each(|(&low, &high)| visit(Leaf::Real { low, high }))
+            }
+            Self::Tuple(parts) => parts.iter().try_for_each(|part| part.try_for_each_leaf(visit)),
+        }
+    }
+
+    fn for_each_leaf(&self, mut visit: impl FnMut(Leaf)) {
+        let Ok(()) = self.try_for_each_leaf::<Infallible>(&mut |leaf| {
+            visit(leaf);
+            Ok(())
+        });
+    }
+
+    /// The components in order.
+    pub fn leaves(&self) -> Vec<Leaf> {
+        let mut leaves = Vec::new();
+        self.for_each_leaf(|leaf| leaves.push(leaf));
+        leaves
+    }
+
+    /// Number of discrete components.
+    pub fn discrete_width(&self) -> usize {
+        match self {
+            Self::Discrete(_) => 1,
+            Self::MultiDiscrete(n) => n.len(),
+            Self::Box { .. } => 0,
+            Self::Tuple(parts) => parts.iter().map(Self::discrete_width).sum(),
+        }
+    }
+
+    /// Number of real components.
+    pub fn real_width(&self) -> usize {
+        match self {
+            Self::Discrete(_) | Self::MultiDiscrete(_) => 0,
+            Self::Box { low, .. } => low.len(),
+            Self::Tuple(parts) => parts.iter().map(Self::real_width).sum(),
+        }
+    }
+
+    /// Length of the one-hot vector of [`Space::flatten_into`].
+    pub fn flat_width(&self) -> usize {
+        let mut width = 0;
+        self.for_each_leaf(|leaf| match leaf {
+            Leaf::Discrete { classes } => width += usize::from(classes),
+            Leaf::Real { .. } => width += 1,
+        });
+        width
+    }
+
+    /// Checks that the space itself makes sense: `1..=256` classes, as many lower as upper bounds, no NaN, low <= high.
+    ///
+    /// # Errors
+    /// A sentence that names the offending component.
+    pub fn validate(&self) -> Result<(), String> {
+        if let Self::Box { low, high } = self
+            && low.len() != high.len()
+        {
+            return Err(format!("a box has {} lower and {} upper bounds", low.len(), high.len()));
+        }
+        if let Self::Tuple(parts) = self {
+            return parts.iter().try_for_each(Self::validate);
+        }
+        for (index, leaf) in self.leaves().iter().enumerate() {
+            match *leaf {
+                Leaf::Discrete { classes } if classes == 0 || classes > MAX_CLASSES => {
+                    return Err(format!("component {index} has {classes} classes, allowed is 1..={MAX_CLASSES}"));
+                }
+                Leaf::Real { low, high } if low.is_nan() || high.is_nan() || low > high => {
+                    return Err(format!("component {index} has the bounds {low}..={high}"));
+                }
+                _ => {}
+            }
+        }
+        Ok(())
+    }
+
+    /// Checks that `value` is a point of this space.
+    ///
+    /// # Errors
+    /// The first component that is not.
+    pub fn check(&self, value: Value<'_>) -> Result<(), SpaceError> {
+        let (expected_discrete, expected_real) = (self.discrete_width(), self.real_width());
+        if value.discrete.len() != expected_discrete || value.real.len() != expected_real {
+            return Err(SpaceError::Width {
+                expected_discrete,
+                expected_real,
+                discrete: value.discrete.len(),
+                real: value.real.len(),
+            });
+        }
+        let (mut discrete, mut real) = (0, 0);
+        self.try_for_each_leaf(&mut |leaf| {
+            match leaf {
+                Leaf::Discrete { classes } => {
+                    let class = value.discrete[discrete];
+                    if u16::from(class) >= classes {
+                        return Err(SpaceError::Class { index: discrete, value: class, classes });
+                    }
+                    discrete += 1;
+                }
+                Leaf::Real { low, high } => {
+                    let x = value.real[real];
+                    if !x.is_finite() || x < low || x > high {
+                        return Err(SpaceError::Real { index: real, value: x, low, high });
+                    }
+                    real += 1;
+                }
+            }
+            Ok(())
+        })
+    }
+
+    /// Writes the flat form of `value` (each discrete component one-hot, each real as it is, in the order of the
+    /// leaves) into `out`, of length [`Space::flat_width`].
+    pub fn flatten_into(&self, value: Value<'_>, out: &mut [f32]) {
+        let (mut discrete, mut real, mut at) = (0, 0, 0);
+        self.for_each_leaf(|leaf| match leaf {
+            Leaf::Discrete { classes } => {
+                let end = at + usize::from(classes);
+                out[at..end].fill(0.0);
+                out[at + usize::from(value.discrete[discrete])] = 1.0;
+                (discrete, at) = (discrete + 1, end);
+            }
+            Leaf::Real { .. } => {
+                out[at] = value.real[real];
+                (real, at) = (real + 1, at + 1);
+            }
+        });
+    }
+
+    /// Draws a point uniformly into `out` (the random policy, if this is an action space).
+    ///
+    /// # Panics
+    /// If `out` has another width than the space.
+    pub fn sample_into(&self, rng: &mut EpisodeRng, out: ValueMut<'_>) {
+        let ValueMut { discrete, real } = out;
+        let (mut discrete, mut real) = (discrete.iter_mut(), real.iter_mut());
+        self.for_each_leaf(|leaf| match leaf {
+            Leaf::Discrete { classes } => {
+                *discrete.next().expect("one place a component") = below(rng, u32::from(classes)) as u8;
+            }
+            Leaf::Real { low, high } => {
+                // An unbounded side is taken as the largest f32, so that the result is always a point of the space.
+                let (low, high) = (low.max(f32::MIN), high.min(f32::MAX));
+                let x = uniform(rng, f64::from(low), f64::from(high)) as f32;
+                *real.next().expect("one place a component") = x.clamp(low, high);
+            }
+        });
+    }
+}
+
+impl Slab {
+    /// `rows` points of `space`, all zero.
+    pub fn new(space: &Space, rows: usize) -> Self {
+        let (discrete_width, real_width) = (space.discrete_width(), space.real_width());
+        Self {
+            discrete_width,
+            real_width,
+            discrete: vec![0; rows * discrete_width],
+            real: vec![0.0; rows * real_width],
+        }
+    }
+
+    /// Row `row`.
+    pub fn row(&self, row: usize) -> Value<'_> {
+        Value {
+            discrete: &self.discrete[row * self.discrete_width..][..self.discrete_width],
+            real: &self.real[row * self.real_width..][..self.real_width],
+        }
+    }
+
+    /// Row `row`, to be written.
+    pub fn row_mut(&mut self, row: usize) -> ValueMut<'_> {
+        ValueMut {
+            discrete: &mut self.discrete[row * self.discrete_width..][..self.discrete_width],
+            real: &mut self.real[row * self.real_width..][..self.real_width],
+        }
+    }
+
+    /// Appends a row.
+    pub fn push(&mut self, value: Value<'_>) {
+        self.discrete.extend_from_slice(value.discrete);
+        self.real.extend_from_slice(value.real);
+    }
+
+    /// Copies `value` into row `row`.
+    pub fn set(&mut self, row: usize, value: Value<'_>) {
+        let out = self.row_mut(row);
+        out.discrete.copy_from_slice(value.discrete);
+        out.real.copy_from_slice(value.real);
+    }
+
+    /// Removes all rows, keeping the storage.
+    pub fn clear(&mut self) {
+        self.discrete.clear();
+        self.real.clear();
+    }
+}
