@@ -1,0 +1,100 @@
+//! The command line.
+
+use std::net::SocketAddr;
+
+use popgym_proto::{limits, transport};
+
+/// Steps environments and streams episodes to a learner.
+///
+/// Exit codes: 0 the run is complete, 1 failure (the reason in one line), 2 wrong usage.
+#[derive(Clone, Debug, clap::Parser)]
+#[command(name = "actor", version)]
+pub struct Args {
+    /// Where the learner listens, for example http://gpu-box:5555
+    #[arg(long, env = "POPGYM_LEARNER", value_name = "URL", value_parser = learner_url)]
+    pub learner: String,
+
+    /// Episodes stepped at a time, on one core
+    #[arg(long, env = "POPGYM_SLOTS", value_name = "N", default_value_t = 128, value_parser = clap::value_parser!(u32).range(1..=i64::from(limits::MAX_SLOTS)))]
+    pub slots: u32,
+
+    /// Name of this actor in the learner's log; host name and process id if not given
+    #[arg(long, env = "POPGYM_ACTOR_NAME", value_parser = name)]
+    pub name: Option<String>,
+
+    /// Work for this run only: a learner of another run is refused
+    #[arg(long, env = "POPGYM_RUN", value_name = "ID", value_parser = name)]
+    pub run: Option<String>,
+
+    /// Serve Prometheus metrics here, for example 0.0.0.0:9100; off if not given
+    #[arg(long, env = "POPGYM_ACTOR_METRICS_LISTEN", value_name = "ADDR")]
+    pub metrics_listen: Option<SocketAddr>,
+
+    /// Give up when there has been no learner for this long
+    #[arg(long, env = "POPGYM_RETRY_SECONDS", value_name = "S", default_value_t = 300)]
+    pub retry_seconds: u64,
+
+    /// End when standard input ends: with the process that started this one
+    #[arg(long)]
+    pub with_parent: bool,
+
+    /// Lower this process's priority: 0 (not at all) to 19 (runs when nothing else does)
+    #[arg(long, value_name = "N", default_value_t = 0, value_parser = clap::value_parser!(i32).range(0..=19))]
+    pub nice: i32,
+}
+
+/// A URL, `http://` added where no scheme is given.
+fn learner_url(text: &str) -> Result<String, String> {
+    let url = if text.contains("://") { text.to_owned() } else { format!("http://{text}") };
+    if !url.starts_with("http://") {
+        return Err("expected http://HOST:PORT (there is no TLS; use a private network or a tunnel)".to_owned());
+    }
+    let endpoint = transport::endpoint(&url).map_err(|_| "expected http://HOST:PORT".to_owned())?;
+    match endpoint.uri().port() {
+        Some(_) => Ok(url),
+        None => Err("the port is missing: expected http://HOST:PORT".to_owned()),
+    }
+}
+
+fn name(text: &str) -> Result<String, String> {
+    let legal = !text.is_empty()
+        && text.chars().count() <= limits::MAX_NAME_CHARS
+        && !text.chars().any(|c| c.is_whitespace() || c.is_control());
+    if legal {
+        Ok(text.to_owned())
+    } else {
+        Err(format!("expected 1 to {} characters, none of them white space", limits::MAX_NAME_CHARS))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use clap::{CommandFactory as _, Parser as _};
+
+    use super::*;
+
+    fn parse(args: &[&str]) -> Result<Args, clap::Error> {
+        Args::try_parse_from(["actor"].iter().chain(args))
+    }
+
+    #[test]
+    fn the_command_line_is_consistent() {
+        Args::command().debug_assert();
+    }
+
+    #[test]
+    fn a_learner_is_an_http_url_with_a_port() {
+        assert_eq!(parse(&["--learner", "box:5555"]).unwrap().learner, "http://box:5555");
+        assert_eq!(parse(&["--learner", "http://[::1]:5555"]).unwrap().learner, "http://[::1]:5555");
+        for wrong in ["https://box:5555", "http://box", "http://b x:1", ""] {
+            assert_eq!(parse(&["--learner", wrong]).unwrap_err().exit_code(), 2, "{wrong}");
+        }
+    }
+
+    #[test]
+    fn numbers_have_limits() {
+        for wrong in [["--slots", "0"], ["--slots", "4097"], ["--nice", "20"], ["--name", "a b"], ["--run", ""]] {
+            assert!(parse(&["--learner", "a:1", wrong[0], wrong[1]]).is_err(), "{wrong:?}");
+        }
+    }
+}

@@ -1,0 +1,255 @@
+//! The command line.
+
+use std::path::PathBuf;
+
+use clap::{Parser, Subcommand, ValueEnum};
+use serde::Serialize;
+use toml::{Table, Value};
+
+use crate::ppo_keys::PpoFlags;
+
+/// Trains agents that must remember: PPO on whole episodes, sampled by actors.
+#[derive(Debug, Parser)]
+#[command(name = "learner", version)]
+pub struct Args {
+    /// What to do.
+    #[command(subcommand)]
+    pub command: Command,
+}
+
+/// What to do.
+#[derive(Debug, Subcommand)]
+pub enum Command {
+    /// Train an agent; without flags, GRU on RepeatPreviousEasy into a new directory below runs/
+    Train(Box<TrainArgs>),
+    /// Continue a run from its last checkpoint
+    Resume(ResumeArgs),
+    /// Play episodes with a trained agent, never those it was trained on
+    Eval(EvalArgs),
+    /// Show what can be named
+    List(ListArgs),
+}
+
+/// `learner train`.
+#[derive(Debug, clap::Args)]
+pub struct TrainArgs {
+    /// Configuration file (TOML); flags win over it
+    #[arg(long, value_name = "FILE")]
+    pub config: Option<PathBuf>,
+    /// Directory of the run [default: a new one below runs/]
+    #[arg(long, value_name = "DIR")]
+    pub out: Option<PathBuf>,
+    /// Resume if DIR holds a run of the same configuration, start if it is empty
+    #[arg(long = "continue", requires = "out")]
+    pub continue_run: bool,
+    /// Memory (`learner list memories`) [default: gru]
+    #[arg(long, value_name = "NAME")]
+    pub memory: Option<String>,
+    /// Keys of the run.
+    #[command(flatten)]
+    pub run: RunFlags,
+    /// Keys of `[service]`.
+    #[command(flatten)]
+    pub service: ServiceFlags,
+    /// Keys of `[policy]`.
+    #[command(flatten)]
+    pub policy: PolicyFlags,
+    /// Keys of `[ppo]`.
+    #[command(flatten)]
+    pub ppo: PpoFlags,
+}
+
+/// Keys at the top of the configuration.
+#[derive(Debug, Default, clap::Args, Serialize)]
+pub struct RunFlags {
+    /// Environment (`learner list envs`) [default: RepeatPreviousEasy]
+    #[arg(long, value_name = "ID")]
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub env: Option<String>,
+    /// Where defaults come from (`learner list presets`) [default: quick]
+    #[arg(long, value_name = "NAME")]
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub preset: Option<String>,
+    /// Stop after the first epoch with as many environment steps [default: 1000000 quick, 15000000 paper]
+    #[arg(long, value_name = "N")]
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub steps: Option<u64>,
+    /// Stop after the first epoch whose MMER reaches X
+    #[arg(long, value_name = "X", allow_hyphen_values = true)]
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub stop_at_mmer: Option<f64>,
+    /// Seed of everything random in the run [default: 0]
+    #[arg(long, value_name = "S")]
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub seed: Option<u64>,
+    /// 0: sample with the newest weights; 1: with those before, while the learner learns [default: 0]
+    #[arg(long, value_name = "0|1")]
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub lag: Option<u32>,
+    /// auto, cpu or cuda [default: auto]
+    #[arg(long, value_name = "D")]
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub device: Option<String>,
+    /// Threads of the learner's libtorch; results depend on it [default: one a core, 8 at most]
+    #[arg(long, value_name = "N")]
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub threads: Option<u32>,
+    /// An episode that reaches as many steps is truncated [default: 1024]
+    #[arg(long, value_name = "N")]
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub max_episode_steps: Option<u32>,
+    /// Rows that actors pad to on machines where results depend on the number of rows [default: 128]
+    #[arg(long, value_name = "N")]
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub rows: Option<u32>,
+    /// Epochs between checkpoints [default: 10]
+    #[arg(long, value_name = "N")]
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub checkpoint_epochs: Option<u64>,
+    /// Checkpoints kept, beside the best [default: 3]
+    #[arg(long, value_name = "N")]
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub keep_checkpoints: Option<u32>,
+}
+
+/// Keys of `[service]`.
+#[derive(Debug, Default, clap::Args, Serialize)]
+#[command(next_help_heading = "Service")]
+pub struct ServiceFlags {
+    /// Local actor processes; 0 waits for remote ones [default: one a core]
+    #[arg(long, value_name = "N")]
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub actors: Option<u32>,
+    /// Episodes that a local actor steps at a time [default: 128]
+    #[arg(long, value_name = "N")]
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub slots: Option<u32>,
+    /// Address for actors [default: 127.0.0.1:0, or 127.0.0.1:50051 with --actors 0]
+    #[arg(long, value_name = "ADDR")]
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub listen: Option<String>,
+    /// Address for Prometheus [default: none]
+    #[arg(long, value_name = "ADDR")]
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub metrics_listen: Option<String>,
+}
+
+/// Keys of `[policy]`.
+#[derive(Debug, Default, clap::Args, Serialize)]
+#[command(next_help_heading = "Policy")]
+pub struct PolicyFlags {
+    /// Smallest log standard deviation of a continuous action
+    #[arg(long, value_name = "X", allow_hyphen_values = true)]
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub log_std_min: Option<f64>,
+    /// Largest log standard deviation of a continuous action
+    #[arg(long, value_name = "X", allow_hyphen_values = true)]
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub log_std_max: Option<f64>,
+}
+
+/// `learner resume`.
+#[derive(Debug, clap::Args)]
+pub struct ResumeArgs {
+    /// Directory of the run
+    pub dir: PathBuf,
+    /// Stop after the first epoch with as many environment steps [default: as configured]
+    #[arg(long, value_name = "N")]
+    pub steps: Option<u64>,
+    /// auto, cpu or cuda [default: as configured]
+    #[arg(long, value_name = "D")]
+    pub device: Option<String>,
+    /// Keys of `[service]`.
+    #[command(flatten)]
+    pub service: ServiceFlags,
+}
+
+/// `learner eval`.
+#[derive(Debug, clap::Args)]
+pub struct EvalArgs {
+    /// Directory of the run
+    pub dir: PathBuf,
+    /// Episodes to play
+    #[arg(long, value_name = "N", default_value_t = 100)]
+    pub episodes: u64,
+    /// Seed of the episodes; they are never those of training
+    #[arg(long, value_name = "S", default_value_t = 0)]
+    pub seed: u64,
+    /// Which weights: of the checkpoint with the best mean return, or the last
+    #[arg(long, value_enum, default_value_t = Which::Best)]
+    pub checkpoint: Which,
+    /// Local actor processes
+    #[arg(long, value_name = "N", default_value_t = 1)]
+    pub actors: u32,
+    /// Print JSON
+    #[arg(long)]
+    pub json: bool,
+}
+
+/// Which checkpoint.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub enum Which {
+    /// The one with the best mean return.
+    Best,
+    /// The last.
+    Last,
+}
+
+/// `learner list`.
+#[derive(Debug, clap::Args)]
+pub struct ListArgs {
+    /// What to list
+    #[arg(value_enum)]
+    pub what: Listed,
+    /// Print JSON
+    #[arg(long)]
+    pub json: bool,
+}
+
+/// What can be listed.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub enum Listed {
+    /// Environments.
+    Envs,
+    /// Memories.
+    Memories,
+    /// Presets.
+    Presets,
+}
+
+impl TrainArgs {
+    /// The flags that were given, as a configuration table.
+    ///
+    /// # Errors
+    /// A number too large for TOML.
+    pub fn table(&self) -> anyhow::Result<Table> {
+        let mut table = Table::try_from(&self.run)?;
+        insert(&mut table, "service", Table::try_from(&self.service)?);
+        insert(&mut table, "policy", Table::try_from(&self.policy)?);
+        insert(&mut table, "ppo", Table::try_from(&self.ppo)?);
+        if let Some(memory) = &self.memory {
+            let memory = Table::from_iter([("name".to_owned(), Value::String(memory.clone()))]);
+            insert(&mut table, "memory", memory);
+        }
+        Ok(table)
+    }
+}
+
+impl ResumeArgs {
+    /// The flags that were given, as a configuration table.
+    ///
+    /// # Errors
+    /// A number too large for TOML.
+    pub fn table(&self) -> anyhow::Result<Table> {
+        let flags = RunFlags { steps: self.steps, device: self.device.clone(), ..RunFlags::default() };
+        let mut table = Table::try_from(flags)?;
+        insert(&mut table, "service", Table::try_from(&self.service)?);
+        Ok(table)
+    }
+}
+
+fn insert(table: &mut Table, key: &str, part: Table) {
+    if !part.is_empty() {
+        table.insert(key.to_owned(), Value::Table(part));
+    }
+}

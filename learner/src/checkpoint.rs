@@ -1,0 +1,243 @@
+//! Checkpoints: all that a run needs to continue bit for bit.
+//!
+//! `checkpoints/epoch-000012/` holds `weights.safetensors`, `sampling.safetensors` (only where the open epoch is sampled
+//! with other weights: lag 1), `optimizer.safetensors` and `manifest.json`, with the SHA-256 of each file. The directory
+//! is written under a temporary name, synced and renamed, so that one that has its name is whole.
+
+use std::collections::BTreeMap;
+use std::fs::{self, File};
+use std::io::Write;
+use std::path::{Path, PathBuf};
+
+use anyhow::{Context, bail, ensure};
+use bytes::Bytes;
+use popgym_models::weights;
+use serde::{Deserialize, Serialize};
+use sha2::{Digest, Sha256};
+use tch::{Kind, Tensor};
+
+use crate::adam::AdamState;
+
+const FORMAT: u32 = 1;
+const MANIFEST: &str = "manifest.json";
+const WEIGHTS: &str = "weights.safetensors";
+const SAMPLING: &str = "sampling.safetensors";
+const OPTIMIZER: &str = "optimizer.safetensors";
+const TEMPORARY_SUFFIX: &str = ".tmp";
+
+/// The numbers of a run after some epochs.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Progress {
+    /// Completed epochs: also the version of the weights.
+    pub epoch: u64,
+    /// Environment steps of all epochs.
+    pub env_steps: u64,
+    /// Episodes of all epochs.
+    pub episodes: u64,
+    /// Coefficient of the KL term in the next epoch.
+    pub kl_coef: f64,
+    /// Largest mean return of an epoch so far.
+    pub mmer: Option<f64>,
+    /// Mean return of the last epoch.
+    pub mean_return: Option<f64>,
+    /// Returns of the last episodes (100 at most), oldest first.
+    pub recent_returns: Vec<f64>,
+    /// Wall-clock seconds so far.
+    pub wall_seconds: f64,
+}
+
+/// A run's state between two epochs.
+pub struct Checkpoint {
+    /// Where the run stands.
+    pub progress: Progress,
+    /// The newest weights, safetensors.
+    pub weights: Bytes,
+    /// The weights that sample the next epoch, safetensors.
+    pub sampling: Bytes,
+    /// The optimiser.
+    pub optimizer: AdamState,
+}
+
+#[derive(Serialize, Deserialize)]
+struct Manifest {
+    format: u32,
+    /// Environment id, memory and other things that tell a person what this is.
+    about: BTreeMap<String, String>,
+    progress: Progress,
+    optimizer_steps: u64,
+    /// File name to SHA-256, hexadecimal.
+    files: BTreeMap<String, String>,
+}
+
+impl Checkpoint {
+    /// Writes the checkpoint below `dir` and returns its path. `about` is kept in the manifest for people.
+    ///
+    /// # Errors
+    /// The file or directory that cannot be written. What was there before is untouched.
+    pub fn save(&self, dir: &Path, about: &BTreeMap<String, String>) -> anyhow::Result<PathBuf> {
+        let path = dir.join(format!("epoch-{:06}", self.progress.epoch));
+        let temporary = path.with_extension(TEMPORARY_SUFFIX.trim_start_matches('.'));
+        remove_dir_if_there(&temporary)?;
+        fs::create_dir_all(&temporary).with_context(|| format!("cannot create {}", temporary.display()))?;
+        let mut files = BTreeMap::new();
+        for (name, bytes) in self.files() {
+            write_synced(&temporary.join(name), &bytes)?;
+            files.insert(name.to_owned(), hex_digest(&bytes));
+        }
+        let manifest = Manifest {
+            format: FORMAT,
+            about: about.clone(),
+            progress: self.progress.clone(),
+            optimizer_steps: self.optimizer.steps,
+            files,
+        };
+        write_synced(&temporary.join(MANIFEST), &serde_json::to_vec_pretty(&manifest)?)?;
+        sync_dir(&temporary)?;
+        remove_dir_if_there(&path)?;
+        fs::rename(&temporary, &path).with_context(|| format!("cannot rename {}", temporary.display()))?;
+        sync_dir(dir)?;
+        Ok(path)
+    }
+
+    fn files(&self) -> Vec<(&'static str, Bytes)> {
+        let moments = BTreeMap::from([
+            ("first_moment".to_owned(), self.optimizer.first_moment.shallow_clone()),
+            ("second_moment".to_owned(), self.optimizer.second_moment.shallow_clone()),
+        ]);
+        let mut files = vec![(WEIGHTS, self.weights.clone()), (OPTIMIZER, weights::to_bytes(&moments).into())];
+        if self.sampling != self.weights {
+            files.push((SAMPLING, self.sampling.clone()));
+        }
+        files
+    }
+
+    /// Reads the checkpoint at `path`; its optimiser has `parameters` numbers.
+    ///
+    /// # Errors
+    /// A file that is missing, cannot be read, or is not what the manifest says.
+    pub fn load(path: &Path, parameters: i64) -> anyhow::Result<Self> {
+        let manifest = read_manifest(path)?;
+        let mut files = BTreeMap::new();
+        for (name, digest) in &manifest.files {
+            let file = path.join(name);
+            let bytes = fs::read(&file).with_context(|| format!("cannot read {}", file.display()))?;
+            ensure!(hex_digest(&bytes) == *digest, "{} is damaged: its SHA-256 is not the manifest's", file.display());
+            files.insert(name.as_str(), Bytes::from(bytes));
+        }
+        let get = |name: &str| files.get(name).cloned().with_context(|| format!("{} lacks {name}", path.display()));
+        let zeros = || Tensor::zeros([parameters], (Kind::Float, tch::Device::Cpu));
+        let moments = BTreeMap::from([("first_moment".to_owned(), zeros()), ("second_moment".to_owned(), zeros())]);
+        weights::load_into(&moments, &get(OPTIMIZER)?).with_context(|| path.join(OPTIMIZER).display().to_string())?;
+        let moment = |name: &str| moments[name].shallow_clone();
+        Ok(Self {
+            progress: manifest.progress,
+            weights: get(WEIGHTS)?,
+            sampling: get(SAMPLING).or_else(|_| get(WEIGHTS))?,
+            optimizer: AdamState {
+                first_moment: moment("first_moment"),
+                second_moment: moment("second_moment"),
+                steps: manifest.optimizer_steps,
+            },
+        })
+    }
+
+    /// The newest checkpoint below `dir` that is whole; a damaged one is reported and the one before is taken.
+    ///
+    /// # Errors
+    /// There are checkpoints, and every one is damaged.
+    pub fn latest(dir: &Path, parameters: i64) -> anyhow::Result<Option<Self>> {
+        let paths = list(dir)?;
+        let mut last_error = None;
+        for path in paths.into_iter().rev() {
+            match Self::load(&path, parameters) {
+                Ok(checkpoint) => return Ok(Some(checkpoint)),
+                Err(error) => {
+                    tracing::warn!("checkpoint not used: {error:#}");
+                    last_error = Some(error);
+                }
+            }
+        }
+        last_error.map_or(Ok(None), |error| Err(error.context("no checkpoint can be used")))
+    }
+}
+
+/// The paths of the checkpoints below `dir`, oldest first.
+///
+/// # Errors
+/// The directory is there but cannot be read.
+pub fn list(dir: &Path) -> anyhow::Result<Vec<PathBuf>> {
+    let entries = match fs::read_dir(dir) {
+        Ok(entries) => entries,
+        Err(error) if error.kind() == std::io::ErrorKind::NotFound => return Ok(Vec::new()),
+        Err(error) => bail!("cannot read {}: {error}", dir.display()),
+    };
+    let mut paths = Vec::new();
+    for entry in entries {
+        let path = entry.with_context(|| format!("cannot read {}", dir.display()))?.path();
+        let name = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
+        if name.strip_prefix("epoch-").is_some_and(|number| number.bytes().all(|byte| byte.is_ascii_digit())) {
+            paths.push(path);
+        }
+    }
+    paths.sort_by_key(|path| (path.as_os_str().len(), path.clone()));
+    Ok(paths)
+}
+
+/// The best checkpoint below `dir`: the one whose epoch had the largest mean return, the newest of equals.
+///
+/// # Errors
+/// The directory cannot be read.
+pub fn best(dir: &Path) -> anyhow::Result<Option<PathBuf>> {
+    let score = |path: &PathBuf| read_manifest(path).ok().and_then(|manifest| manifest.progress.mean_return);
+    let scored = list(dir)?.into_iter().filter_map(|path| score(&path).map(|score| (score, path)));
+    Ok(scored.max_by(|a, b| a.0.total_cmp(&b.0)).map(|(_, path)| path))
+}
+
+/// Removes all checkpoints below `dir` but the newest `keep` and the best.
+///
+/// # Errors
+/// One that cannot be removed.
+pub fn prune(dir: &Path, keep: usize) -> anyhow::Result<()> {
+    let paths = list(dir)?;
+    let best = best(dir)?;
+    let old = paths.len().saturating_sub(keep);
+    for path in paths.into_iter().take(old).filter(|path| Some(path) != best.as_ref()) {
+        fs::remove_dir_all(&path).with_context(|| format!("cannot remove {}", path.display()))?;
+    }
+    Ok(())
+}
+
+fn read_manifest(path: &Path) -> anyhow::Result<Manifest> {
+    let file = path.join(MANIFEST);
+    let bytes = fs::read(&file).with_context(|| format!("cannot read {}", file.display()))?;
+    let manifest: Manifest =
+        serde_json::from_slice(&bytes).with_context(|| format!("{} is not a manifest", file.display()))?;
+    ensure!(manifest.format == FORMAT, "{} has format {}, expected {FORMAT}", file.display(), manifest.format);
+    Ok(manifest)
+}
+
+fn write_synced(path: &Path, bytes: &[u8]) -> anyhow::Result<()> {
+    let write = || {
+        let mut file = File::create(path)?;
+        file.write_all(bytes)?;
+        file.sync_all()
+    };
+    write().with_context(|| format!("cannot write {}", path.display()))
+}
+
+fn sync_dir(path: &Path) -> anyhow::Result<()> {
+    File::open(path).and_then(|dir| dir.sync_all()).with_context(|| format!("cannot sync {}", path.display()))
+}
+
+fn remove_dir_if_there(path: &Path) -> anyhow::Result<()> {
+    match fs::remove_dir_all(path) {
+        Err(error) if error.kind() != std::io::ErrorKind::NotFound => {
+            Err(error).with_context(|| format!("cannot remove {}", path.display()))
+        }
+        _ => Ok(()),
+    }
+}
+
+fn hex_digest(bytes: &[u8]) -> String {
+    Sha256::digest(bytes).iter().map(|byte| format!("{byte:02x}")).collect()
+}

@@ -1,0 +1,100 @@
+//! popgym-rs's learner: PPO on whole episodes, the service for actors, and the user's commands.
+//!
+//! | module | holds |
+//! |---|---|
+//! | [`commands`] | `train`, `resume`, `eval`, `list` |
+//! | [`config`], [`ppo_keys`] | the configuration: presets, file and flags merged |
+//! | [`trainer`] | the epochs of a run, one after the other |
+//! | [`update`] | PPO, top to bottom; [`gae`], [`adam`] and [`batch`] are what it uses |
+//! | [`service`] | sessions with actors, leases, episodes |
+//! | [`local_actors`] | actor processes on this machine |
+//! | [`checkpoint`], [`run_dir`] | what a run leaves on disk to continue from |
+//! | [`observer`] | what a run tells: files, progress bar, TensorBoard, Prometheus |
+//!
+//! A user's own `main` adds environments, memories and observers to [`Extensions`] and calls [`run`].
+
+pub mod adam;
+pub mod args;
+pub mod batch;
+pub mod checkpoint;
+pub mod commands;
+pub mod config;
+pub mod gae;
+pub mod interrupt;
+pub mod local_actors;
+pub mod observer;
+pub mod ppo_keys;
+pub mod run_dir;
+pub mod service;
+pub mod session;
+pub mod trainer;
+pub mod update;
+
+use std::ffi::OsString;
+use std::io::IsTerminal;
+use std::process::ExitCode;
+
+use clap::Parser;
+
+use crate::args::{Args, Command};
+use crate::commands::Failure;
+use crate::observer::{Observer, Progress};
+
+/// What a user's own program adds to popgym-rs.
+pub struct Extensions {
+    /// The environments that can be named.
+    pub envs: popgym_envs::Registry,
+    /// The memories that can be named.
+    pub memories: popgym_models::memory::Registry,
+    /// Observers beside those of the learner.
+    pub observers: Vec<Box<dyn Observer>>,
+}
+
+impl Default for Extensions {
+    fn default() -> Self {
+        Self {
+            envs: popgym_envs::Registry::standard(),
+            memories: popgym_models::memory::Registry::standard(),
+            observers: Vec::new(),
+        }
+    }
+}
+
+/// The whole program: `arguments` as from the command line, the program's name first.
+///
+/// Exit status: 0 done, 1 failed, 2 bad usage or configuration, 130 interrupted. Results go to standard output, all else to
+/// standard error.
+pub fn run(extensions: Extensions, arguments: impl IntoIterator<Item = OsString>) -> ExitCode {
+    let args = match Args::try_parse_from(arguments) {
+        Ok(args) => args,
+        Err(error) => {
+            // Help and version are no errors; clap knows where each goes.
+            let _ = error.print();
+            return ExitCode::from(if error.use_stderr() { 2 } else { 0 });
+        }
+    };
+    let filter = tracing_subscriber::EnvFilter::try_from_default_env().unwrap_or_else(|_| "info".into());
+    tracing_subscriber::fmt()
+        .with_env_filter(filter)
+        .with_writer(Progress::log_writer)
+        .with_ansi(std::io::stderr().is_terminal())
+        .with_target(false)
+        .init();
+    let result = match args.command {
+        Command::Train(args) => commands::train(&args, extensions),
+        Command::Resume(args) => commands::resume(&args, extensions),
+        Command::Eval(args) => commands::eval(&args, &extensions),
+        Command::List(args) => commands::list(&args, &extensions),
+    };
+    match result {
+        Ok(status) => ExitCode::from(status),
+        Err(Failure::Usage(error)) => {
+            eprintln!("error: {error:#}");
+            ExitCode::from(2)
+        }
+        Err(Failure::Run(error)) => {
+            eprintln!("error: {error:#}");
+            ExitCode::from(1)
+        }
+    }
+}

@@ -1,0 +1,171 @@
+//! The run as Prometheus metrics, through the `metrics` crate; an exporter is the business of `main`.
+
+use metrics::{Unit, counter, describe_counter, describe_gauge, describe_histogram, gauge, histogram};
+
+use super::{EpochReport, Observer, RunStart};
+
+/// Sets the metrics `popgym_learner_...` after every epoch.
+///
+/// Seconds are histograms, because counters of the `metrics` crate are whole numbers: the rate of their `_sum` shows
+/// where the time goes.
+#[derive(Default)]
+pub struct Prometheus;
+
+impl Prometheus {
+    /// The observer; it records wherever the `metrics` crate's recorder is at the time.
+    pub fn new() -> Self {
+        Self
+    }
+
+    /// Tells the recorder the meaning and unit of each metric; once, after the recorder is installed.
+    pub fn describe() {
+        describe_gauge!("popgym_learner_run_info", "What is trained, in labels; always 1.");
+        describe_gauge!("popgym_learner_target_steps", Unit::Count, "Environment steps after which the run stops.");
+        describe_counter!("popgym_learner_epochs_total", Unit::Count, "Epochs completed.");
+        describe_gauge!("popgym_learner_weights_version", Unit::Count, "Epochs of training in the newest weights.");
+        describe_counter!("popgym_learner_env_steps_total", Unit::Count, "Environment steps of completed epochs.");
+        describe_counter!("popgym_learner_episodes_total", Unit::Count, "Episodes of completed epochs.");
+        describe_counter!("popgym_learner_surplus_steps_total", Unit::Count, "Steps sampled and thrown away.");
+        describe_gauge!("popgym_learner_return_mean", "Mean return of the last epoch's episodes.");
+        describe_gauge!("popgym_learner_return_min", "Smallest return of the last epoch.");
+        describe_gauge!("popgym_learner_return_max", "Largest return of the last epoch.");
+        describe_gauge!("popgym_learner_return_mmer", "Largest mean return of an epoch so far.");
+        describe_gauge!("popgym_learner_episode_length_mean", Unit::Count, "Mean steps of the last epoch's episodes.");
+        describe_gauge!("popgym_learner_policy_loss", "Clipped surrogate loss.");
+        describe_gauge!("popgym_learner_value_loss", "Clamped squared error of the critic.");
+        describe_gauge!("popgym_learner_kl_nats", "KL(old policy || new policy) per step.");
+        describe_gauge!("popgym_learner_kl_coef", "Coefficient of the KL term.");
+        describe_gauge!("popgym_learner_entropy_nats", "Entropy of the policy per step.");
+        describe_gauge!("popgym_learner_explained_variance_ratio", "Variance of returns that the critic explains.");
+        describe_gauge!("popgym_learner_grad_norm", "Norm of the gradient before clipping.");
+        describe_gauge!("popgym_learner_learning_rate", "Learning rate.");
+        describe_gauge!("popgym_learner_valid_ratio", "Steps the memory needed to compute, of those it computed.");
+        describe_gauge!("popgym_learner_steps_per_second", "Environment steps per second of the last epoch.");
+        describe_gauge!("popgym_learner_wall_seconds", Unit::Seconds, "Age of the run, earlier sessions included.");
+        let seconds = |name, meaning| describe_histogram!(name, Unit::Seconds, meaning);
+        seconds("popgym_learner_collect_seconds", "From the opening of an epoch's sampling to its completion.");
+        seconds("popgym_learner_wait_seconds", "Time in an epoch that the learner only waited for episodes.");
+        seconds("popgym_learner_learn_seconds", "Time of an epoch's update.");
+        seconds("popgym_learner_other_seconds", "Time of an epoch's encoding, checkpoint and files.");
+        describe_gauge!(
+            "popgym_learner_log_prob_difference",
+            "Largest difference of log-probabilities between actors and learner; not small: a wrong actor build."
+        );
+        describe_gauge!("popgym_learner_actors", Unit::Count, "Actors connected at the end of the last epoch.");
+    }
+}
+
+impl Observer for Prometheus {
+    fn run_start(&mut self, start: &RunStart) -> anyhow::Result<()> {
+        gauge!(
+            "popgym_learner_run_info",
+            "env" => start.env.clone(),
+            "memory" => start.memory.clone(),
+            "preset" => start.preset.clone(),
+            "seed" => start.seed.to_string(),
+        )
+        .set(1.0);
+        gauge!("popgym_learner_target_steps").set(start.total_steps as f64);
+        counter!("popgym_learner_epochs_total").absolute(start.epoch);
+        gauge!("popgym_learner_weights_version").set(start.epoch as f64);
+        counter!("popgym_learner_env_steps_total").absolute(start.env_steps);
+        if let Some(mmer) = start.mmer {
+            gauge!("popgym_learner_return_mmer").set(mmer);
+        }
+        Ok(())
+    }
+
+    fn epoch(&mut self, EpochReport { metrics, timing }: &EpochReport) -> anyhow::Result<()> {
+        counter!("popgym_learner_epochs_total").absolute(metrics.epoch + 1);
+        gauge!("popgym_learner_weights_version").set((metrics.epoch + 1) as f64);
+        counter!("popgym_learner_env_steps_total").absolute(metrics.env_steps);
+        counter!("popgym_learner_episodes_total").absolute(metrics.episodes);
+        counter!("popgym_learner_surplus_steps_total").increment(timing.surplus_steps);
+        gauge!("popgym_learner_return_mean").set(metrics.mean_return);
+        gauge!("popgym_learner_return_min").set(metrics.min_return);
+        gauge!("popgym_learner_return_max").set(metrics.max_return);
+        gauge!("popgym_learner_return_mmer").set(metrics.mmer);
+        gauge!("popgym_learner_episode_length_mean").set(metrics.mean_length);
+        gauge!("popgym_learner_policy_loss").set(metrics.policy_loss);
+        gauge!("popgym_learner_value_loss").set(metrics.value_loss);
+        gauge!("popgym_learner_kl_nats").set(metrics.kl);
+        gauge!("popgym_learner_kl_coef").set(metrics.kl_coef);
+        gauge!("popgym_learner_entropy_nats").set(metrics.entropy);
+        gauge!("popgym_learner_explained_variance_ratio").set(metrics.explained_variance);
+        gauge!("popgym_learner_grad_norm").set(metrics.grad_norm);
+        gauge!("popgym_learner_learning_rate").set(metrics.learning_rate);
+        gauge!("popgym_learner_valid_ratio").set(metrics.valid_fraction);
+        gauge!("popgym_learner_steps_per_second").set(timing.steps_per_second);
+        gauge!("popgym_learner_wall_seconds").set(timing.wall_seconds);
+        histogram!("popgym_learner_collect_seconds").record(timing.collect_seconds);
+        histogram!("popgym_learner_wait_seconds").record(timing.wait_seconds);
+        histogram!("popgym_learner_learn_seconds").record(timing.learn_seconds);
+        histogram!("popgym_learner_other_seconds").record(timing.other_seconds);
+        gauge!("popgym_learner_log_prob_difference").set(timing.log_prob_difference);
+        gauge!("popgym_learner_actors").set(timing.actors as f64);
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::path::Path;
+
+    use metrics_exporter_prometheus::PrometheusBuilder;
+
+    use super::super::samples::{report, start};
+    use super::*;
+
+    /// What a scrape returns after a resumed run's epochs 3 and 4.
+    fn scrape() -> String {
+        let recorder = PrometheusBuilder::new().build_recorder();
+        metrics::with_local_recorder(&recorder, || {
+            Prometheus::describe();
+            let mut observer = Prometheus::new();
+            observer.run_start(&start(Path::new("run"), 3)).unwrap();
+            observer.epoch(&report(3)).unwrap();
+            observer.epoch(&report(4)).unwrap();
+        });
+        recorder.handle().render()
+    }
+
+    #[test]
+    fn values() {
+        let text = scrape();
+        for line in [
+            "popgym_learner_run_info{env=\"RepeatPreviousEasy\",memory=\"GRU\",preset=\"paper\",seed=\"0\"} 1",
+            "# TYPE popgym_learner_env_steps_total counter",
+            "popgym_learner_env_steps_total 5000",
+            "popgym_learner_epochs_total 5",
+            "popgym_learner_weights_version 5",
+            "popgym_learner_episodes_total 50",
+            "popgym_learner_surplus_steps_total 80",
+            "popgym_learner_return_mean 0.5",
+            "popgym_learner_return_mmer 0.5",
+            "popgym_learner_return_min -0.25",
+            "popgym_learner_return_max 1.25",
+            "popgym_learner_policy_loss 0.01",
+            "popgym_learner_steps_per_second 500",
+            "popgym_learner_collect_seconds_sum 3",
+            "popgym_learner_wait_seconds_sum 0.5",
+            "popgym_learner_learn_seconds_sum 0.75",
+            "popgym_learner_learn_seconds_count 2",
+            "popgym_learner_actors 4",
+        ] {
+            assert!(text.lines().any(|candidate| candidate == line), "no line `{line}` in\n{text}");
+        }
+    }
+
+    #[test]
+    fn every_metric_is_described() {
+        let text = scrape();
+        let words = |prefix: &str| -> Vec<String> {
+            let lines = text.lines().filter_map(|line| line.strip_prefix(prefix));
+            let mut names: Vec<_> = lines.map(|line| line.split(' ').next().unwrap().to_owned()).collect();
+            names.sort();
+            names
+        };
+        assert_eq!(words("# HELP "), words("# TYPE "));
+        assert_eq!(words("# TYPE ").len(), 29);
+    }
+}

@@ -1,0 +1,354 @@
+//! The single owner of sessions, leases and received episodes: one task, no locks.
+//!
+//! At any moment at most one epoch is open. Its episodes are numbered from 0; each is leased to one session at a time;
+//! those of a session that ends are leased again, lowest number first. The batch is the shortest prefix that reaches the
+//! target, so it does not depend on who sampled what, or when.
+
+use std::collections::{BTreeMap, BTreeSet, HashMap};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
+use std::time::Instant;
+
+use popgym_proto::{Episode, EpisodeBatch, Hello, Leases, OpenEpoch, WeightSet, limits};
+use tokio::sync::{mpsc, oneshot};
+use tonic::Status;
+use tracing::info;
+
+use super::planner::{LengthEstimate, Progress, Seat, Target, assign, further_leases};
+use super::session::Order;
+use super::{Collected, metrics};
+
+/// What reaches the coordinator.
+#[derive(Debug)]
+pub(super) enum Event {
+    /// An actor is ready.
+    Joined { session: u64, hello: Hello, orders: mpsc::Sender<Order>, reply: oneshot::Sender<Result<(), Status>> },
+    /// An actor sent legal episodes.
+    Episodes { session: u64, batch: EpisodeBatch },
+    /// A session has ended.
+    Left { session: u64, reason: String },
+    /// The trainer opens an epoch.
+    Open { epoch: u64, weights: WeightSet, target: Target },
+    /// The trainer has finished: tell all actors, answer when they have gone.
+    Finish { reason: String, gone: oneshot::Sender<()> },
+}
+
+/// What others may look at at any time.
+#[derive(Debug, Default)]
+pub(super) struct Shared {
+    pub(super) actors: AtomicUsize,
+    pub(super) prefix_steps: AtomicU64,
+}
+
+/// Names of actors that are remembered, to tell who returns. Beyond, an actor that returns looks new; nothing else.
+const MAX_KNOWN_ACTORS: usize = 65_536;
+
+struct Session {
+    actor: String,
+    slots: u32,
+    orders: mpsc::Sender<Order>,
+    /// Version of the weights that were sent to it.
+    version: Option<u64>,
+    held: BTreeSet<u64>,
+}
+
+struct Epoch {
+    epoch: u64,
+    weights: WeightSet,
+    target: Target,
+    opened: Instant,
+    /// The lowest number that was never leased.
+    next: u64,
+    /// Numbers that were leased, and lost.
+    lost: BTreeSet<u64>,
+    /// Number -> who has it.
+    holders: HashMap<u64, u64>,
+    received: BTreeMap<u64, Episode>,
+    received_steps: u64,
+    /// Length of the prefix that is complete, and its steps; never beyond the batch.
+    prefix: u64,
+    prefix_steps: u64,
+}
+
+pub(super) struct Coordinator {
+    sessions: BTreeMap<u64, Session>,
+    /// Actor -> its newest incarnation.
+    known: HashMap<String, u64>,
+    /// `None`: nothing to sample at the moment.
+    epoch: Option<Epoch>,
+    length: LengthEstimate,
+    results: std::sync::mpsc::Sender<Collected>,
+    shared: Arc<Shared>,
+    finishing: Option<(String, oneshot::Sender<()>)>,
+}
+
+impl Coordinator {
+    pub(super) fn new(max_steps: u32, results: std::sync::mpsc::Sender<Collected>, shared: Arc<Shared>) -> Self {
+        Self {
+            sessions: BTreeMap::new(),
+            known: HashMap::new(),
+            epoch: None,
+            length: LengthEstimate::unknown(max_steps),
+            results,
+            shared,
+            finishing: None,
+        }
+    }
+
+    /// Handles events until all who could send one have gone.
+    pub(super) async fn run(mut self, mut events: mpsc::Receiver<Event>) {
+        let mut pending = Vec::with_capacity(limits::COORDINATOR_QUEUE);
+        // All that has arrived is handled before leases are planned: one plan, not one for each message.
+        while events.recv_many(&mut pending, limits::COORDINATOR_QUEUE).await > 0 {
+            let queued = events.len() + pending.len();
+            for event in pending.drain(..) {
+                self.handle(event);
+            }
+            self.close_if_complete();
+            self.lease();
+            metrics::queues(queued, self.epoch.as_ref().map_or(0, |epoch| epoch.holders.len()));
+            if self.sessions.is_empty()
+                && let Some((_, gone)) = self.finishing.take()
+            {
+                // The trainer may have stopped waiting.
+                let _ = gone.send(());
+                return;
+            }
+        }
+    }
+
+    fn handle(&mut self, event: Event) {
+        match event {
+            Event::Joined { session, hello, orders, reply } => {
+                let answer = self.join(session, &hello, orders);
+                let accepted = answer.is_ok();
+                if reply.send(answer).is_err() && accepted {
+                    self.leave(session, "closed its connection");
+                } else if accepted {
+                    self.greet(session);
+                }
+            }
+            Event::Episodes { session, batch } => self.receive(session, batch),
+            Event::Left { session, reason } => self.leave(session, &reason),
+            Event::Open { epoch, weights, target } => self.open(epoch, weights, target),
+            Event::Finish { reason, gone } => {
+                self.epoch = None;
+                self.finishing = Some((reason.clone(), gone));
+                self.order_all(|_| Some(Order::Stop { reason: reason.clone() }));
+            }
+        }
+    }
+
+    fn join(&mut self, session: u64, hello: &Hello, orders: mpsc::Sender<Order>) -> Result<(), Status> {
+        let known = self.known.get(&hello.actor).copied();
+        if known.is_some_and(|newest| hello.incarnation <= newest) {
+            return Err(Status::failed_precondition(format!(
+                "another actor named {} has connected since; give each its own --name",
+                hello.actor
+            )));
+        }
+        let older = self.sessions.iter().find(|(_, session)| session.actor == hello.actor).map(|(&id, _)| id);
+        if let Some(older) = older {
+            let superseded = "another actor of this name has connected; give each its own --name";
+            self.order(older, Order::End(Status::failed_precondition(superseded)));
+            self.leave(older, "connected anew");
+        }
+        if known.is_some() || self.known.len() < MAX_KNOWN_ACTORS {
+            self.known.insert(hello.actor.clone(), hello.incarnation);
+        }
+        let (actor, slots) = (hello.actor.clone(), hello.slots);
+        let what = if known.is_some() { "actor returned" } else { "actor joined" };
+        info!(actor, slots, actors = self.sessions.len() + 1, "{what}");
+        metrics::joined(known.is_some());
+        self.sessions.insert(session, Session { actor, slots, orders, version: None, held: BTreeSet::new() });
+        self.count_actors();
+        Ok(())
+    }
+
+    /// Tells a newcomer how things stand.
+    fn greet(&mut self, session: u64) {
+        if let Some((reason, _)) = &self.finishing {
+            self.order(session, Order::Stop { reason: reason.clone() });
+        } else if self.epoch.is_some() {
+            self.announce(session);
+        }
+    }
+
+    /// Tells a session of the open epoch, with the weights if it does not have them.
+    fn announce(&mut self, id: u64) {
+        let (Some(epoch), Some(session)) = (&self.epoch, self.sessions.get_mut(&id)) else { return };
+        let version = epoch.weights.version;
+        let weights = (session.version != Some(version)).then(|| epoch.weights.clone());
+        session.version = Some(version);
+        let order = Order::Open(OpenEpoch { epoch: epoch.epoch, version, weights });
+        self.order(id, order);
+    }
+
+    /// Hands an order to a session. One that leaves its orders unread is dropped: nothing here waits.
+    fn order(&mut self, id: u64, order: Order) {
+        let Some(session) = self.sessions.get(&id) else { return };
+        if session.orders.try_send(order).is_err() {
+            self.leave(id, "left its messages unread");
+        }
+    }
+
+    fn order_all(&mut self, order: impl Fn(&Session) -> Option<Order>) {
+        let orders: Vec<(u64, Order)> =
+            self.sessions.iter().filter_map(|(&id, session)| Some((id, order(session)?))).collect();
+        for (id, order) in orders {
+            self.order(id, order);
+        }
+    }
+
+    /// Forgets a session; its leases are free again.
+    fn leave(&mut self, id: u64, reason: &str) {
+        let Some(session) = self.sessions.remove(&id) else { return };
+        self.count_actors();
+        if self.finishing.is_some() {
+            return;
+        }
+        let leases = session.held.len();
+        if let Some(epoch) = &mut self.epoch {
+            for index in &session.held {
+                epoch.holders.remove(index);
+            }
+            epoch.lost.extend(session.held);
+        }
+        metrics::leases_lost(leases);
+        let actors = self.sessions.len();
+        info!(actor = session.actor, actors, "actor lost ({reason}); its {leases} leases are leased again");
+    }
+
+    fn count_actors(&self) {
+        self.shared.actors.store(self.sessions.len(), Ordering::Relaxed);
+        metrics::actors(self.sessions.len());
+    }
+
+    fn open(&mut self, epoch: u64, weights: WeightSet, target: Target) {
+        for session in self.sessions.values_mut() {
+            session.held.clear();
+        }
+        self.shared.prefix_steps.store(0, Ordering::Relaxed);
+        self.epoch = Some(Epoch {
+            epoch,
+            weights,
+            target,
+            opened: Instant::now(),
+            next: 0,
+            lost: BTreeSet::new(),
+            holders: HashMap::new(),
+            received: BTreeMap::new(),
+            received_steps: 0,
+            prefix: 0,
+            prefix_steps: 0,
+        });
+        let sessions: Vec<u64> = self.sessions.keys().copied().collect();
+        for session in sessions {
+            self.announce(session);
+        }
+    }
+
+    /// Keeps the episodes that are leased to this session; counts and drops the others.
+    fn receive(&mut self, id: u64, batch: EpisodeBatch) {
+        let Some(session) = self.sessions.get_mut(&id) else { return };
+        let Some(epoch) = self.epoch.as_mut().filter(|epoch| epoch.epoch == batch.epoch) else {
+            return metrics::refused("late", batch.episodes.len());
+        };
+        if batch.version != epoch.weights.version {
+            return metrics::refused("version", batch.episodes.len());
+        }
+        for episode in batch.episodes {
+            // A duplicate is not held any more, so it is refused here too.
+            if !session.held.remove(&episode.index) {
+                metrics::refused("unleased", 1);
+                continue;
+            }
+            metrics::accepted();
+            self.length.see(episode.steps);
+            epoch.accept(episode);
+        }
+        self.shared.prefix_steps.store(epoch.prefix_steps, Ordering::Relaxed);
+    }
+
+    /// Where the prefix is a batch: hands it to the trainer, and calls off what is under way.
+    fn close_if_complete(&mut self) {
+        let Some(epoch) = self.epoch.take_if(|epoch| epoch.is_complete()) else { return };
+        self.length = LengthEstimate::next_epoch(epoch.prefix_steps as f64 / epoch.prefix.max(1) as f64);
+        let number = epoch.epoch;
+        self.order_all(|session| (!session.held.is_empty()).then_some(Order::Close { epoch: number }));
+        for session in self.sessions.values_mut() {
+            session.held.clear();
+        }
+        let collected = epoch.into_collected();
+        metrics::surplus(collected.surplus_steps);
+        // The trainer may be ending.
+        let _ = self.results.send(collected);
+    }
+
+    /// Leases what the batch still needs to whoever has room.
+    fn lease(&mut self) {
+        let Some(epoch) = &mut self.epoch else { return };
+        let further = further_leases(epoch.target, epoch.progress(), self.length);
+        // Lost leases count as outstanding, so what is further is beyond them.
+        let count = further as usize + epoch.lost.len();
+        if count == 0 {
+            return;
+        }
+        let seats = self.sessions.iter().map(|(&session, s)| Seat { session, slots: s.slots, held: s.held.len() });
+        let mut leases: BTreeMap<u64, Vec<u64>> = BTreeMap::new();
+        for session in assign(count, seats) {
+            let index = epoch.lost.pop_first().unwrap_or_else(|| {
+                epoch.next += 1;
+                epoch.next - 1
+            });
+            epoch.holders.insert(index, session);
+            leases.entry(session).or_default().push(index);
+        }
+        let number = epoch.epoch;
+        for (id, episodes) in leases {
+            if let Some(session) = self.sessions.get_mut(&id) {
+                session.held.extend(&episodes);
+            }
+            self.order(id, Order::Lease(Leases { epoch: number, episodes }));
+        }
+    }
+}
+
+impl Epoch {
+    fn progress(&self) -> Progress {
+        Progress {
+            received: self.received.len() as u64,
+            received_steps: self.received_steps,
+            outstanding: (self.holders.len() + self.lost.len()) as u64,
+        }
+    }
+
+    fn accept(&mut self, episode: Episode) {
+        self.holders.remove(&episode.index);
+        self.received_steps += episode.steps as u64;
+        self.received.insert(episode.index, episode);
+        while !self.is_complete()
+            && let Some(episode) = self.received.get(&self.prefix)
+        {
+            self.prefix_steps += episode.steps as u64;
+            self.prefix += 1;
+        }
+    }
+
+    fn is_complete(&self) -> bool {
+        self.target.reached(self.prefix, self.prefix_steps)
+    }
+
+    fn into_collected(mut self) -> Collected {
+        let surplus = self.received.split_off(&self.prefix);
+        Collected {
+            epoch: self.epoch,
+            version: self.weights.version,
+            steps: self.prefix_steps,
+            episodes: self.received.into_values().collect(),
+            surplus_episodes: surplus.len() as u64,
+            surplus_steps: surplus.values().map(|episode| episode.steps as u64).sum(),
+            seconds: self.opened.elapsed().as_secs_f64(),
+        }
+    }
+}

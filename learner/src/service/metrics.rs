@@ -1,0 +1,66 @@
+//! What Prometheus sees of the service. All names start with `popgym_learner_`.
+
+use metrics::{counter, describe_counter, describe_gauge, gauge};
+
+/// Names and explains every metric of the service.
+pub(super) fn describe() {
+    describe_gauge!("popgym_learner_actors", "Actors that are connected and ready");
+    describe_counter!("popgym_learner_sessions_total", "Sessions that got as far as being ready");
+    describe_counter!("popgym_learner_reconnects_total", "Sessions of actors that had been here before");
+    describe_counter!("popgym_learner_handshakes_refused_total", "Actors that were refused");
+    describe_counter!("popgym_learner_leases_lost_total", "Leases of actors that went away; they are leased again");
+    describe_counter!("popgym_learner_episodes_accepted_total", "Episodes received and wanted");
+    describe_counter!(
+        "popgym_learner_episodes_refused_total",
+        "Episodes received and dropped, by reason: illegal (what is illegal), late, unleased, version"
+    );
+    describe_counter!("popgym_learner_surplus_steps_total", "Steps of episodes beyond the end of their epoch's batch");
+    describe_counter!("popgym_learner_received_bytes_total", "Bytes of the columns of episodes received");
+    describe_counter!("popgym_learner_sent_bytes_total", "Bytes of weights sent");
+    describe_gauge!("popgym_learner_event_queue", "Events of sessions that wait for the coordinator");
+    describe_gauge!("popgym_learner_leases_outstanding", "Episodes leased and not received");
+}
+
+pub(super) fn actors(count: usize) {
+    gauge!("popgym_learner_actors").set(count as f64);
+}
+
+pub(super) fn joined(returned: bool) {
+    counter!("popgym_learner_sessions_total").increment(1);
+    if returned {
+        counter!("popgym_learner_reconnects_total").increment(1);
+    }
+}
+
+pub(super) fn handshake_refused() {
+    counter!("popgym_learner_handshakes_refused_total").increment(1);
+}
+
+pub(super) fn leases_lost(count: usize) {
+    counter!("popgym_learner_leases_lost_total").increment(count as u64);
+}
+
+pub(super) fn accepted() {
+    counter!("popgym_learner_episodes_accepted_total").increment(1);
+}
+
+pub(super) fn refused(reason: &'static str, episodes: usize) {
+    counter!("popgym_learner_episodes_refused_total", "reason" => reason).increment(episodes as u64);
+}
+
+pub(super) fn surplus(steps: u64) {
+    counter!("popgym_learner_surplus_steps_total").increment(steps);
+}
+
+pub(super) fn received(bytes: usize) {
+    counter!("popgym_learner_received_bytes_total").increment(bytes as u64);
+}
+
+pub(super) fn sent(bytes: usize) {
+    counter!("popgym_learner_sent_bytes_total").increment(bytes as u64);
+}
+
+pub(super) fn queues(events: usize, leases: usize) {
+    gauge!("popgym_learner_event_queue").set(events as f64);
+    gauge!("popgym_learner_leases_outstanding").set(leases as f64);
+}

@@ -1,0 +1,356 @@
+//! The service against simulated actors over real sockets.
+
+use std::sync::Mutex;
+use std::time::Instant;
+
+use popgym_envs::space::Space;
+use popgym_proto::{ActorMessage, Columns, EpisodeBatch, Hello, LearnerMessage, OpenEpoch, PROTOCOL_VERSION};
+use tokio::runtime::Runtime;
+
+use super::*;
+
+const FINGERPRINT: Fingerprint = [3; 32];
+/// Safetensors without a tensor.
+const WEIGHTS: Bytes = Bytes::from_static(b"\x02\0\0\0\0\0\0\0{}");
+const MAX_STEPS: u32 = 40;
+
+fn service() -> Service {
+    let spec = RunSpec {
+        run: "test".to_owned(),
+        env: "env".to_owned(),
+        max_episode_steps: MAX_STEPS,
+        memory: "gru".to_owned(),
+        memory_options: toml::Table::new(),
+        policy_options: toml::Table::new(),
+        seed: 0,
+        lag: 0,
+        rows: 16,
+        evaluation: false,
+    };
+    let episodes =
+        EpisodeSpec { observation: Space::Discrete(256), action: Space::MultiDiscrete(vec![4]), max_steps: MAX_STEPS };
+    Service::start(TcpListener::bind("127.0.0.1:0").unwrap(), spec, episodes, FINGERPRINT).unwrap()
+}
+
+/// Episode `index` of `epoch`, whoever samples it: of 1 to 40 steps.
+fn episode(epoch: u64, index: u64) -> Episode {
+    let number = (epoch << 32 | index).wrapping_mul(0x9e37_79b9_7f4a_7c15) >> 17;
+    let steps = 1 + number as usize % MAX_STEPS as usize;
+    let discrete = |rows: usize, classes: u64| Columns {
+        discrete: (0..rows as u64).map(|t| ((number + t) % classes) as u8).collect(),
+        real: Vec::new(),
+    };
+    Episode {
+        index,
+        steps,
+        observations: discrete(steps + 1, 256),
+        actions: discrete(steps, 4),
+        rewards: (0..steps).map(|t| t as f64).collect(),
+        log_probs: vec![-1.0; steps],
+        terminated: true,
+        truncated: false,
+    }
+}
+
+/// What a simulated actor does with its leases.
+#[derive(Clone, Copy, PartialEq)]
+enum Conduct {
+    Honest,
+    /// Goes away as soon as it holds leases.
+    Vanishes,
+    /// Sends an episode with a class out of range.
+    SendsGarbage,
+    /// Sends everything twice, and what it does not hold, and what is of another epoch or version.
+    SendsTooMuch,
+    /// Takes leases, and sends nothing.
+    Sits,
+}
+
+/// What a simulated actor saw.
+#[derive(Debug, Default)]
+struct Seen {
+    epochs: Vec<OpenEpoch>,
+    leases: Vec<u64>,
+    closed: Vec<u64>,
+}
+
+struct Actors {
+    runtime: Runtime,
+    address: SocketAddr,
+}
+
+impl Actors {
+    fn of(service: &Service) -> Self {
+        Self { runtime: Runtime::new().unwrap(), address: service.addr() }
+    }
+
+    fn spawn(&self, name: &str, conduct: Conduct) -> Handle {
+        let seen = Arc::new(Mutex::new(Seen::default()));
+        let actor = simulate(self.address, hello(name), FINGERPRINT, conduct, seen.clone());
+        Handle { seen, end: self.runtime.spawn(actor) }
+    }
+
+    fn end(&self, actor: Handle) -> Result<String, Status> {
+        let end = self.runtime.block_on(async { tokio::time::timeout(Duration::from_secs(20), actor.end).await });
+        end.expect("the actor ends in time").unwrap()
+    }
+}
+
+struct Handle {
+    seen: Arc<Mutex<Seen>>,
+    end: tokio::task::JoinHandle<Result<String, Status>>,
+}
+
+fn hello(name: &str) -> Hello {
+    Hello {
+        protocol_version: PROTOCOL_VERSION,
+        build: "test".to_owned(),
+        actor: name.to_owned(),
+        incarnation: 1,
+        slots: 8,
+        run: None,
+    }
+}
+
+/// One session, until the learner says stop (its reason) or ends it (the status).
+async fn simulate(
+    address: SocketAddr,
+    hello: Hello,
+    fingerprint: Fingerprint,
+    conduct: Conduct,
+    seen: Arc<Mutex<Seen>>,
+) -> Result<String, Status> {
+    let channel = transport::endpoint(&format!("http://{address}")).unwrap().connect().await.unwrap();
+    let (requests, stream) = mpsc::channel(16);
+    requests.send(ActorMessage::Hello(hello).into_wire()).await.unwrap();
+    let mut replies = transport::client(channel).session(ReceiverStream::new(stream)).await?.into_inner();
+    let send = async |message: ActorMessage| drop(requests.send(message.into_wire()).await);
+    let mut version = 0;
+    while let Some(message) = replies.message().await? {
+        match LearnerMessage::from_wire(message).unwrap() {
+            LearnerMessage::Welcome(_) => send(ActorMessage::Ready(fingerprint)).await,
+            LearnerMessage::Epoch(epoch) => {
+                version = epoch.version;
+                seen.lock().unwrap().epochs.push(epoch);
+            }
+            LearnerMessage::Leases(leases) => {
+                seen.lock().unwrap().leases.extend(&leases.episodes);
+                let epoch = leases.epoch;
+                let episodes: Vec<Episode> = leases.episodes.iter().map(|&index| self::episode(epoch, index)).collect();
+                let batch = EpisodeBatch { epoch, version, episodes };
+                match conduct {
+                    Conduct::Sits => {}
+                    Conduct::Vanishes => return Ok("vanished".to_owned()),
+                    Conduct::Honest => send(ActorMessage::Episodes(batch)).await,
+                    Conduct::SendsGarbage => {
+                        let mut wire = ActorMessage::Episodes(batch).into_wire();
+                        if let Some(wire::from_actor::Message::Episodes(batch)) = &mut wire.message {
+                            batch.episodes[0].actions_discrete =
+                                vec![77; batch.episodes[0].actions_discrete.len()].into();
+                        }
+                        requests.send(wire).await.unwrap();
+                    }
+                    Conduct::SendsTooMuch => {
+                        let other = EpisodeBatch { epoch: epoch + 1, ..batch.clone() };
+                        let untimely = EpisodeBatch { version: version + 9, ..batch.clone() };
+                        let unleased = EpisodeBatch { episodes: vec![self::episode(epoch, 1 << 40)], ..batch.clone() };
+                        for batch in [other, untimely, unleased, batch.clone(), batch] {
+                            send(ActorMessage::Episodes(batch)).await;
+                        }
+                    }
+                }
+            }
+            LearnerMessage::Closed { epoch } => seen.lock().unwrap().closed.push(epoch),
+            LearnerMessage::Stop { reason } => return Ok(reason),
+            LearnerMessage::Heartbeat => {}
+        }
+    }
+    Err(Status::cancelled("the stream ended"))
+}
+
+fn wait_for(what: &str, done: impl Fn() -> bool) {
+    let deadline = Instant::now() + Duration::from_secs(20);
+    while !done() {
+        assert!(Instant::now() < deadline, "{what}");
+        std::thread::sleep(Duration::from_millis(5));
+    }
+}
+
+fn collect(service: &Service) -> Collected {
+    let deadline = Instant::now() + Duration::from_secs(30);
+    service.collect(|| Instant::now() > deadline).expect("a batch in time")
+}
+
+/// The batch by definition: episodes 0, 1, ... until the target is reached.
+fn expected(epoch: u64, target: Target) -> Vec<Episode> {
+    let (mut batch, mut steps) = (Vec::new(), 0);
+    while !target.reached(batch.len() as u64, steps) {
+        batch.push(episode(epoch, batch.len() as u64));
+        steps += batch.last().unwrap().steps as u64;
+    }
+    batch
+}
+
+#[test]
+fn sixty_four_actors_at_once_are_all_served() {
+    let service = service();
+    let actors = Actors::of(&service);
+    let handles: Vec<Handle> = (0..64).map(|i| actors.spawn(&format!("actor-{i}"), Conduct::Honest)).collect();
+    wait_for("64 actors", || service.actors() == 64);
+    for epoch in 0..3 {
+        service.open(epoch, epoch, WEIGHTS, Target::Steps(20_000)).unwrap();
+        let collected = collect(&service);
+        assert_eq!(collected.episodes, expected(epoch, Target::Steps(20_000)));
+        assert_eq!(collected.steps, collected.episodes.iter().map(|episode| episode.steps as u64).sum::<u64>());
+    }
+    assert!(handles.iter().all(|actor| !actor.seen.lock().unwrap().leases.is_empty()));
+    assert!(handles.iter().all(|actor| actor.seen.lock().unwrap().epochs.len() == 3));
+    service.finish("done");
+    for actor in handles {
+        assert_eq!(actors.end(actor).unwrap(), "done");
+    }
+}
+
+#[test]
+fn the_batch_does_not_depend_on_the_number_of_actors() {
+    for count in [1, 2, 7] {
+        let service = service();
+        let actors = Actors::of(&service);
+        // Actors may come at any time.
+        let target = Target::Steps(3_000);
+        service.open(5, 4, WEIGHTS, target).unwrap();
+        let handles: Vec<Handle> = (0..count).map(|i| actors.spawn(&format!("actor-{i}"), Conduct::Honest)).collect();
+        let collected = collect(&service);
+        assert_eq!((collected.epoch, collected.version), (5, 4));
+        assert_eq!(collected.episodes, expected(5, target), "{count} actors");
+        service.open(6, 4, WEIGHTS, Target::Episodes(33)).unwrap();
+        assert_eq!(collect(&service).episodes, expected(6, Target::Episodes(33)));
+        service.finish("done");
+        drop(handles);
+    }
+}
+
+#[test]
+fn leases_of_an_actor_that_vanishes_are_leased_again() {
+    let service = service();
+    let actors = Actors::of(&service);
+    let vanishing = actors.spawn("vanishing", Conduct::Vanishes);
+    let staying = actors.spawn("staying", Conduct::Honest);
+    wait_for("two actors", || service.actors() == 2);
+    let target = Target::Steps(2_000);
+    service.open(0, 0, WEIGHTS, target).unwrap();
+    assert_eq!(collect(&service).episodes, expected(0, target));
+    let held = std::mem::take(&mut vanishing.seen.lock().unwrap().leases);
+    assert!(!held.is_empty());
+    let seen = staying.seen.lock().unwrap();
+    assert!(held.iter().all(|index| seen.leases.contains(index)), "{held:?} of {:?}", seen.leases);
+}
+
+#[test]
+fn an_actor_is_refused_with_a_reason() {
+    let service = service();
+    let actors = Actors::of(&service);
+    let refused = |hello: Hello, fingerprint| {
+        let actor = simulate(actors.address, hello, fingerprint, Conduct::Honest, Arc::default());
+        let status = actors.runtime.block_on(actor).unwrap_err();
+        (status.code(), status.message().to_owned())
+    };
+    let (code, reason) = refused(Hello { protocol_version: 99, ..hello("a") }, FINGERPRINT);
+    assert_eq!(code, tonic::Code::FailedPrecondition);
+    assert!(reason.contains("protocol version 99"), "{reason}");
+    let (code, reason) = refused(Hello { run: Some("other".to_owned()), ..hello("a") }, FINGERPRINT);
+    assert_eq!(code, tonic::Code::FailedPrecondition);
+    assert_eq!(reason, "the actor is for the run other, this learner's run is test");
+    let (code, reason) = refused(hello("a"), [4; 32]);
+    assert_eq!(code, tonic::Code::FailedPrecondition);
+    assert!(reason.contains("another environment or policy"), "{reason}");
+    let (code, reason) = refused(Hello { slots: 0, ..hello("a") }, FINGERPRINT);
+    assert_eq!(
+        (code, reason.as_str()),
+        (tonic::Code::InvalidArgument, "an illegal message: slots is 0, allowed is 1..=4096")
+    );
+    assert_eq!(service.actors(), 0);
+}
+
+#[test]
+fn an_illegal_episode_ends_its_session_and_nothing_else() {
+    let service = service();
+    let actors = Actors::of(&service);
+    let garbage = actors.spawn("garbage", Conduct::SendsGarbage);
+    let _honest = actors.spawn("honest", Conduct::Honest);
+    wait_for("two actors", || service.actors() == 2);
+    let target = Target::Steps(1_000);
+    service.open(0, 0, WEIGHTS, target).unwrap();
+    assert_eq!(collect(&service).episodes, expected(0, target));
+    let status = actors.end(garbage).unwrap_err();
+    assert_eq!(status.code(), tonic::Code::InvalidArgument);
+    assert_eq!(status.message(), "an illegal message: actions_discrete[0] is 77, allowed is 0..4");
+}
+
+#[test]
+fn what_nobody_asked_for_changes_nothing() {
+    let service = service();
+    let actors = Actors::of(&service);
+    let _busy = actors.spawn("busy", Conduct::SendsTooMuch);
+    for epoch in 0..3 {
+        let target = Target::Steps(1_500);
+        service.open(epoch, epoch, WEIGHTS, target).unwrap();
+        let collected = collect(&service);
+        assert_eq!(collected.episodes, expected(epoch, target));
+    }
+    assert_eq!(service.actors(), 1);
+}
+
+#[test]
+fn weights_are_sent_once_a_version_and_to_newcomers() {
+    let service = service();
+    let actors = Actors::of(&service);
+    let first = actors.spawn("first", Conduct::Honest);
+    for (epoch, version) in [(0, 0), (1, 0), (2, 1)] {
+        service.open(epoch, version, WEIGHTS, Target::Episodes(5)).unwrap();
+        collect(&service);
+    }
+    let sent: Vec<bool> = first.seen.lock().unwrap().epochs.iter().map(|epoch| epoch.weights.is_some()).collect();
+    assert_eq!(sent, [true, false, true]);
+    service.open(3, 1, WEIGHTS, Target::Steps(1_000_000)).unwrap();
+    let newcomer = actors.spawn("newcomer", Conduct::Sits);
+    wait_for("the newcomer's epoch", || !newcomer.seen.lock().unwrap().epochs.is_empty());
+    let seen = newcomer.seen.lock().unwrap();
+    assert_eq!((seen.epochs[0].epoch, seen.epochs[0].version), (3, 1));
+    assert!(seen.epochs[0].weights.is_some());
+}
+
+#[test]
+fn an_actor_that_connects_anew_replaces_its_older_self() {
+    let service = service();
+    let actors = Actors::of(&service);
+    let older = actors.spawn("twin", Conduct::Sits);
+    service.open(0, 0, WEIGHTS, Target::Episodes(10)).unwrap();
+    wait_for("leases", || !older.seen.lock().unwrap().leases.is_empty());
+    let seen = Arc::default();
+    let newer = Hello { incarnation: 2, ..hello("twin") };
+    actors.runtime.spawn(simulate(actors.address, newer, FINGERPRINT, Conduct::Honest, seen));
+    assert_eq!(collect(&service).episodes, expected(0, Target::Episodes(10)));
+    assert_eq!(actors.end(older).unwrap_err().code(), tonic::Code::FailedPrecondition);
+    // And an older one does not replace a newer.
+    let stale = simulate(actors.address, hello("twin"), FINGERPRINT, Conduct::Honest, Arc::default());
+    let status = actors.runtime.block_on(stale).unwrap_err();
+    assert!(status.message().contains("--name"), "{status}");
+    assert_eq!(service.actors(), 1);
+}
+
+#[test]
+fn actors_are_told_that_the_batch_is_complete() {
+    let service = service();
+    let actors = Actors::of(&service);
+    let sitting = actors.spawn("sitting", Conduct::Sits);
+    service.open(0, 0, WEIGHTS, Target::Episodes(4)).unwrap();
+    wait_for("leases", || sitting.seen.lock().unwrap().leases.len() == 4);
+    // The estimate of an episode's length starts at the longest; so both hold leases of this epoch.
+    let _honest = actors.spawn("honest", Conduct::Honest);
+    wait_for("two actors", || service.actors() == 2);
+    service.open(1, 0, WEIGHTS, Target::Episodes(4)).unwrap();
+    assert!(service.collect(|| true).is_none(), "interrupted");
+    service.finish("enough");
+    assert_eq!(actors.end(sitting).unwrap(), "enough");
+}

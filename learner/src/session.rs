@@ -1,0 +1,154 @@
+//! What training and evaluation share: the environment's specification, policies, the service for actors, and the local
+//! actors, made from a configuration.
+
+use std::net::TcpListener;
+use std::path::PathBuf;
+
+use anyhow::Context;
+use popgym_envs::EnvSpec;
+use popgym_models::{Policy, PolicySpec, memory};
+use popgym_proto::{EpisodeSpec, fingerprint};
+use tch::Device;
+
+use crate::Extensions;
+use crate::config::Config;
+use crate::local_actors::LocalActors;
+use crate::service::Service;
+
+/// One learner at work, with its actors.
+pub struct Session<'a> {
+    config: &'a Config,
+    env: EnvSpec,
+    policy_spec: PolicySpec,
+    memories: memory::Registry,
+    device: Device,
+    parameters: i64,
+    service: Option<Service>,
+    actors: Option<LocalActors>,
+}
+
+impl<'a> Session<'a> {
+    /// Prepares what `config` says; nothing is listening yet.
+    ///
+    /// # Errors
+    /// An environment, memory or device that cannot be had.
+    pub fn new(config: &'a Config, extensions: &Extensions) -> anyhow::Result<Self> {
+        let device = popgym_models::device::parse(&config.device)?;
+        popgym_models::device::set_threads(config.threads);
+        let env = extensions.envs.get(&config.env)?.spec.clone();
+        let policy_spec = config.policy_spec(&env);
+        let mut session = Self {
+            config,
+            env,
+            policy_spec,
+            memories: extensions.memories.clone(),
+            device,
+            parameters: 0,
+            service: None,
+            actors: None,
+        };
+        session.parameters = session.policy()?.parameters().values().map(|tensor| tensor.numel() as i64).sum();
+        if !config.service.metrics_listen.is_empty() {
+            serve_metrics(&config.service.metrics_listen)?;
+        }
+        Ok(session)
+    }
+
+    /// The environment's specification.
+    pub fn env(&self) -> &EnvSpec {
+        &self.env
+    }
+
+    /// Number of trainable parameters.
+    pub fn parameters(&self) -> i64 {
+        self.parameters
+    }
+
+    /// A policy with fresh weights, drawn from libtorch's global generator.
+    ///
+    /// # Errors
+    /// The policy cannot be built.
+    pub fn policy(&self) -> anyhow::Result<Policy> {
+        Ok(Policy::new(&self.policy_spec, &self.memories, self.device)?)
+    }
+
+    /// Starts listening for actors of the run called `run`, and starts the local ones.
+    ///
+    /// # Errors
+    /// The address cannot be listened on, or the actors cannot be started.
+    pub fn serve(&mut self, run: &str, evaluation: bool) -> anyhow::Result<()> {
+        let listen = &self.config.service.listen;
+        let listener = TcpListener::bind(listen).with_context(|| format!("cannot listen for actors on {listen}"))?;
+        let address = listener.local_addr()?;
+        let policy = self.policy()?;
+        let spec = self.config.run_spec(run, evaluation)?;
+        let episodes = EpisodeSpec {
+            observation: self.env.observation.clone(),
+            action: policy.distribution().stored_space(),
+            max_steps: self.env.max_steps.min(self.config.max_episode_steps),
+        };
+        let fingerprint = fingerprint(&spec, &format!("{:?}", self.env), &policy.signature());
+        self.service = Some(Service::start(listener, spec, episodes, fingerprint)?);
+        let service = &self.config.service;
+        if service.actors > 0 {
+            let mut args = vec![
+                "--learner".to_owned(),
+                format!("http://{address}"),
+                "--run".to_owned(),
+                run.to_owned(),
+                "--slots".to_owned(),
+                service.slots.to_string(),
+            ];
+            if self.config.lag == 1 {
+                // They sample while the learner learns on the same cores: they get what it leaves.
+                args.extend(["--nice".to_owned(), "19".to_owned()]);
+            }
+            self.actors = Some(LocalActors::spawn(service.actors as usize, actor_program()?, args)?);
+        } else {
+            tracing::info!("waiting for actors: actor --learner http://{address}");
+        }
+        Ok(())
+    }
+
+    /// The service for actors.
+    ///
+    /// # Errors
+    /// [`Session::serve`] was not called.
+    pub fn service(&self) -> anyhow::Result<&Service> {
+        self.service.as_ref().context("the service has not been started")
+    }
+
+    /// Ends the service and the local actors. With a `reason` all actors are told that the run is complete; without one
+    /// remote actors wait for the learner's return.
+    pub fn end(self, reason: Option<&str>) {
+        if let (Some(service), Some(reason)) = (self.service, reason) {
+            service.finish(reason);
+        }
+        if let Some(actors) = self.actors {
+            actors.stop();
+        }
+    }
+}
+
+/// The `actor` program beside this one.
+fn actor_program() -> anyhow::Result<PathBuf> {
+    let here = std::env::current_exe().context("cannot tell where this program is")?;
+    let actor = here.with_file_name("actor");
+    anyhow::ensure!(
+        actor.exists(),
+        "{} is not there; `make build` builds it, or `--actors 0` waits for actors elsewhere",
+        actor.display()
+    );
+    Ok(actor)
+}
+
+fn serve_metrics(address: &str) -> anyhow::Result<()> {
+    let parsed: std::net::SocketAddr =
+        address.parse().with_context(|| format!("metrics_listen is `{address}`, allowed is IP:PORT"))?;
+    metrics_exporter_prometheus::PrometheusBuilder::new()
+        .with_http_listener(parsed)
+        .install()
+        .with_context(|| format!("cannot serve metrics on {address}"))?;
+    crate::observer::Prometheus::describe();
+    Ok(())
+}

@@ -1,0 +1,359 @@
+//! A run's epochs, one after the other: collect, evaluate, update, broadcast, save, report.
+//!
+//! Version `v` of the weights is the one after `v` updates. With lag 0 epoch `k` is sampled with version `k`, after its
+//! update; with lag 1 with version `k - 1`, while the learner learns from epoch `k - 1`. Nothing here depends on who
+//! sampled an episode, or when.
+
+use std::collections::BTreeMap;
+use std::path::PathBuf;
+use std::time::Instant;
+
+use anyhow::Context;
+use bytes::Bytes;
+use popgym_envs::space::Space;
+use popgym_envs::{Purpose, stream};
+use popgym_models::Policy;
+use popgym_proto::Episode;
+
+use crate::adam::{Adam, AdamOptions, AdamState};
+use crate::batch::Batch;
+use crate::checkpoint::{self, Checkpoint, Progress};
+use crate::config::{Config, LearningRateSchedule};
+use crate::interrupt::Interrupt;
+use crate::observer::{EpochMetrics, EpochReport, EpochTiming, Observer, Summary};
+use crate::service::{Service, Target};
+use crate::update::{self, Schedule, UpdateError, UpdateMeans};
+
+/// Episodes over which a mean return is taken when an epoch has fewer (RLlib's window, which the paper used).
+const RETURN_WINDOW: usize = 100;
+
+/// What a run is made of.
+pub struct Trainer<'a> {
+    /// The resolved configuration.
+    pub config: &'a Config,
+    /// The environment's action space.
+    pub action: Space,
+    /// The policy that learns.
+    pub policy: Policy,
+    /// A second policy for the weights that sampled the epoch.
+    pub behaviour: Policy,
+    /// The actors.
+    pub service: &'a Service,
+    /// Who is told.
+    pub observers: Vec<Box<dyn Observer>>,
+    /// Where checkpoints go.
+    pub checkpoints: PathBuf,
+    /// Set when the user wants to stop.
+    pub interrupt: &'a Interrupt,
+}
+
+/// The state of a run while it goes on.
+struct State {
+    progress: Progress,
+    adam: Adam,
+    /// What a checkpoint would hold now.
+    snapshot: Checkpoint,
+    /// Epoch of the last checkpoint written.
+    saved_epoch: Option<u64>,
+    started: Instant,
+    /// Wall-clock seconds of earlier sessions.
+    earlier_seconds: f64,
+}
+
+impl Trainer<'_> {
+    /// Runs epochs until the run's end, an interrupt, or a divergence; leaves a checkpoint in each case.
+    ///
+    /// # Errors
+    /// The update diverged, or the checkpoint cannot be taken up.
+    pub fn run(mut self, from: Option<Checkpoint>) -> anyhow::Result<Summary> {
+        let mut state = self.start(from)?;
+        self.open(&state)?;
+        let stopped_by = loop {
+            if let Some(reason) = self.reached(&state.progress) {
+                break reason;
+            }
+            match self.epoch(&mut state) {
+                Ok(true) => {}
+                Ok(false) => break "interrupt",
+                Err(error) => {
+                    self.save(&mut state);
+                    return Err(error);
+                }
+            }
+        };
+        self.save(&mut state);
+        let summary = self.summary(&state, stopped_by);
+        self.tell(|observer| observer.run_end(&summary));
+        Ok(summary)
+    }
+
+    fn start(&mut self, from: Option<Checkpoint>) -> anyhow::Result<State> {
+        let ppo = &self.config.ppo;
+        let mut adam = Adam::new(
+            self.policy.parameters(),
+            AdamOptions {
+                beta1: ppo.adam_beta1,
+                beta2: ppo.adam_beta2,
+                epsilon: ppo.adam_epsilon,
+                max_grad_norm: ppo.max_grad_norm,
+            },
+        );
+        let snapshot = if let Some(checkpoint) = from {
+            self.policy.load(&checkpoint.weights).context("the checkpoint's weights do not fit")?;
+            adam.restore(&checkpoint.optimizer).map_err(anyhow::Error::msg)?;
+            checkpoint
+        } else {
+            let progress = Progress {
+                epoch: 0,
+                env_steps: 0,
+                episodes: 0,
+                kl_coef: ppo.kl_coef,
+                mmer: None,
+                mean_return: None,
+                recent_returns: Vec::new(),
+                wall_seconds: 0.0,
+            };
+            let weights = Bytes::from(self.policy.to_bytes());
+            Checkpoint { progress, weights: weights.clone(), sampling: weights, optimizer: copy_moments(adam.state()) }
+        };
+        self.behaviour.load(&snapshot.sampling).context("the checkpoint's sampling weights do not fit")?;
+        Ok(State {
+            saved_epoch: (snapshot.progress.epoch > 0).then_some(snapshot.progress.epoch),
+            earlier_seconds: snapshot.progress.wall_seconds,
+            progress: snapshot.progress.clone(),
+            adam,
+            snapshot,
+            started: Instant::now(),
+        })
+    }
+
+    /// Why the run is complete, if it is.
+    fn reached(&self, progress: &Progress) -> Option<&'static str> {
+        let target = self.config.stop_at_mmer.unwrap_or(f64::INFINITY);
+        if progress.mmer.is_some_and(|mmer| mmer >= target) {
+            Some("mmer")
+        } else {
+            (progress.env_steps >= self.config.steps).then_some("steps")
+        }
+    }
+
+    /// Opens the sampling of the next epoch.
+    fn open(&self, state: &State) -> anyhow::Result<()> {
+        let epoch = state.progress.epoch;
+        if self.reached(&state.progress).is_some() {
+            return Ok(());
+        }
+        self.open_epoch(epoch, epoch.saturating_sub(u64::from(self.config.lag)), state.snapshot.sampling.clone())
+    }
+
+    fn open_epoch(&self, epoch: u64, version: u64, weights: Bytes) -> anyhow::Result<()> {
+        self.service.open(epoch, version, weights, Target::Steps(self.config.ppo.batch_steps as u64))
+    }
+
+    /// One epoch. False: interrupted, and the state is that before the epoch.
+    fn epoch(&mut self, state: &mut State) -> anyhow::Result<bool> {
+        let began = Instant::now();
+        let Some(collected) = self.service.collect(|| self.interrupt.requested()) else {
+            return Ok(false);
+        };
+        let wait_seconds = began.elapsed().as_secs_f64();
+        let epoch = state.progress.epoch;
+        let before = state.progress.clone();
+        account(&mut state.progress, &collected.episodes);
+
+        // COLLECTED: with lag 1 the next epoch is sampled from here on, with the weights as they are now.
+        let pipelined = self.config.lag == 1;
+        let newest = state.snapshot.weights.clone();
+        if pipelined && self.reached(&state.progress).is_none() {
+            self.open_epoch(epoch + 1, epoch, newest.clone())?;
+        }
+
+        // EVALUATE: by the version that sampled the epoch.
+        let learning = Instant::now();
+        let batch = Batch::new(&collected.episodes, &self.action, &self.policy);
+        let old = batch.evaluate(&self.behaviour, &self.config.ppo);
+        if pipelined {
+            self.behaviour.load(&newest)?;
+        }
+
+        // UPDATE
+        let schedule = self.schedule(&before);
+        let means = update::update(
+            &self.policy,
+            &mut state.adam,
+            (&batch, &old),
+            (&self.config.ppo, schedule),
+            &mut stream(self.config.seed, epoch, 0, Purpose::Shuffle),
+            &|| self.interrupt.requested(),
+        );
+        let means = match means {
+            Ok(means) => means,
+            Err(UpdateError::Interrupted) => {
+                state.progress = before;
+                return Ok(false);
+            }
+            Err(error) => {
+                state.progress = before;
+                return Err(error.into());
+            }
+        };
+        let learn_seconds = learning.elapsed().as_secs_f64();
+
+        // BROADCAST
+        let weights = Bytes::from(self.policy.to_bytes());
+        let sampling = if pipelined { newest } else { weights.clone() };
+        let ppo = &self.config.ppo;
+        state.progress.epoch += 1;
+        state.progress.kl_coef = update::next_kl_coef(state.progress.kl_coef, means.kl, ppo.kl_target);
+        state.progress.wall_seconds = state.earlier_seconds + state.started.elapsed().as_secs_f64();
+        let optimizer = copy_moments(state.adam.state());
+        state.snapshot = Checkpoint { progress: state.progress.clone(), weights, sampling, optimizer };
+        if !pipelined {
+            self.open(state)?;
+            self.behaviour.load(&state.snapshot.sampling)?;
+        }
+
+        // REPORT AND SAVE: the row of metrics first, so that a checkpoint never stands without it.
+        let metrics = epoch_metrics(epoch, state, &collected.episodes, &means, schedule, old.explained_variance);
+        let epoch_seconds = state.progress.wall_seconds - before.wall_seconds;
+        let timing = EpochTiming {
+            epoch,
+            env_steps: state.progress.env_steps,
+            wall_seconds: state.progress.wall_seconds,
+            steps_per_second: (state.progress.env_steps - before.env_steps) as f64 / epoch_seconds,
+            collect_seconds: collected.seconds,
+            wait_seconds,
+            learn_seconds,
+            other_seconds: (began.elapsed().as_secs_f64() - wait_seconds - learn_seconds).max(0.0),
+            surplus_steps: collected.surplus_steps,
+            log_prob_difference: old.log_prob_difference,
+            actors: self.service.actors() as u64,
+        };
+        let report = EpochReport { metrics, timing };
+        self.tell(|observer| observer.epoch(&report));
+        if state.progress.epoch.is_multiple_of(self.config.checkpoint_epochs) {
+            self.save(state);
+        }
+        Ok(true)
+    }
+
+    fn schedule(&self, progress: &Progress) -> Schedule {
+        let ppo = &self.config.ppo;
+        let remaining = 1.0 - progress.env_steps as f64 / self.config.steps as f64;
+        let factor = match ppo.learning_rate_schedule {
+            LearningRateSchedule::Constant => 1.0,
+            LearningRateSchedule::Linear => remaining.max(0.0),
+        };
+        Schedule { learning_rate: ppo.learning_rate * factor, kl_coef: progress.kl_coef }
+    }
+
+    /// Writes a checkpoint of the last completed epoch, if there is none yet. A failure is reported; the run goes on.
+    fn save(&mut self, state: &mut State) {
+        let epoch = state.snapshot.progress.epoch;
+        if epoch == 0 || state.saved_epoch == Some(epoch) {
+            return;
+        }
+        let about = BTreeMap::from([
+            ("env".to_owned(), self.config.env.clone()),
+            ("memory".to_owned(), self.config.memory_name().to_owned()),
+            ("preset".to_owned(), self.config.preset.clone()),
+            ("build".to_owned(), env!("CARGO_PKG_VERSION").to_owned()),
+        ]);
+        let saved = state.snapshot.save(&self.checkpoints, &about).and_then(|path| {
+            checkpoint::prune(&self.checkpoints, self.config.keep_checkpoints as usize)?;
+            Ok(path)
+        });
+        match saved {
+            Ok(path) => {
+                state.saved_epoch = Some(epoch);
+                self.tell(|observer| observer.checkpoint(epoch, &path));
+            }
+            Err(error) => {
+                metrics::counter!("popgym_learner_checkpoint_failures_total").increment(1);
+                tracing::error!("checkpoint of epoch {epoch} not written: {error:#}");
+            }
+        }
+    }
+
+    fn tell(&mut self, mut event: impl FnMut(&mut dyn Observer) -> anyhow::Result<()>) {
+        for observer in &mut self.observers {
+            if let Err(error) = event(observer.as_mut()) {
+                tracing::error!("{error:#}");
+            }
+        }
+    }
+
+    fn summary(&self, state: &State, stopped_by: &str) -> Summary {
+        let progress = &state.progress;
+        Summary {
+            env: self.config.env.clone(),
+            memory: self.config.memory_name().to_owned(),
+            preset: self.config.preset.clone(),
+            seed: self.config.seed,
+            lag: self.config.lag,
+            epochs: progress.epoch,
+            env_steps: progress.env_steps,
+            episodes: progress.episodes,
+            mmer: progress.mmer,
+            final_mean_return: progress.mean_return,
+            wall_seconds: state.earlier_seconds + state.started.elapsed().as_secs_f64(),
+            stopped_by: stopped_by.to_owned(),
+        }
+    }
+}
+
+/// Adds an epoch's episodes to the run's numbers.
+fn account(progress: &mut Progress, episodes: &[Episode]) {
+    let returns: Vec<f64> = episodes.iter().map(Episode::total_return).collect();
+    progress.env_steps += episodes.iter().map(|episode| episode.steps as u64).sum::<u64>();
+    progress.episodes += episodes.len() as u64;
+    progress.recent_returns.extend_from_slice(&returns);
+    let surplus = progress.recent_returns.len().saturating_sub(RETURN_WINDOW.max(returns.len()));
+    progress.recent_returns.drain(..surplus);
+    let mean_return = mean(&progress.recent_returns);
+    let surplus = progress.recent_returns.len().saturating_sub(RETURN_WINDOW);
+    progress.recent_returns.drain(..surplus);
+    progress.mean_return = Some(mean_return);
+    progress.mmer = Some(progress.mmer.map_or(mean_return, |mmer| mmer.max(mean_return)));
+}
+
+fn epoch_metrics(
+    epoch: u64,
+    state: &State,
+    episodes: &[Episode],
+    means: &UpdateMeans,
+    schedule: Schedule,
+    explained_variance: f64,
+) -> EpochMetrics {
+    let progress = &state.progress;
+    let returns = episodes.iter().map(Episode::total_return);
+    let lengths: Vec<f64> = episodes.iter().map(|episode| episode.steps as f64).collect();
+    EpochMetrics {
+        epoch,
+        env_steps: progress.env_steps,
+        episodes: progress.episodes,
+        mean_return: progress.mean_return.unwrap_or_default(),
+        min_return: returns.clone().fold(f64::INFINITY, f64::min),
+        max_return: returns.fold(f64::NEG_INFINITY, f64::max),
+        mean_length: mean(&lengths),
+        mmer: progress.mmer.unwrap_or_default(),
+        policy_loss: means.policy_loss,
+        value_loss: means.value_loss,
+        kl: means.kl,
+        kl_coef: schedule.kl_coef,
+        entropy: means.entropy,
+        explained_variance,
+        grad_norm: means.grad_norm,
+        learning_rate: schedule.learning_rate,
+        valid_fraction: means.valid_fraction,
+    }
+}
+
+fn mean(values: &[f64]) -> f64 {
+    values.iter().sum::<f64>() / values.len() as f64
+}
+
+/// A copy of the optimiser's state as it is now.
+fn copy_moments(state: &AdamState) -> AdamState {
+    AdamState { first_moment: state.first_moment.copy(), second_moment: state.second_moment.copy(), steps: state.steps }
+}

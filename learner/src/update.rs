@@ -1,0 +1,243 @@
+//! One epoch's update: proximal policy optimisation (Schulman et al., 2017) on whole episodes.
+//!
+//! Per minibatch, `<.>` being the mean over its steps (reference: RLlib 2.0's PPO, which the paper ran):
+//!
+//! ```text
+//! rho = exp(logp_new - logp_old)
+//! L   = < -min(A rho, A clip(rho, 1 - clip, 1 + clip)) >  +  value_coef < clamp((V - R)^2, 0, value_clip) >
+//!       - entropy_coef < H >  +  kl_coef < KL(old || new) >
+//! ```
+
+use popgym_envs::EpisodeRng;
+use popgym_models::{Packing, Policy};
+use tch::{Device, Kind, Tensor};
+
+use crate::adam::Adam;
+use crate::batch::{Batch, OldPolicy};
+use crate::config::Ppo;
+
+/// Means over all minibatches of all passes, weighted by steps.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct UpdateMeans {
+    /// Clipped surrogate loss.
+    pub policy_loss: f64,
+    /// Clamped squared error of the critic.
+    pub value_loss: f64,
+    /// KL(old || new), nats a step.
+    pub kl: f64,
+    /// Entropy, nats a step.
+    pub entropy: f64,
+    /// Norm of the gradient before it was scaled down.
+    pub grad_norm: f64,
+    /// Steps that the memory needed to compute, divided by those it computed.
+    pub valid_fraction: f64,
+}
+
+/// Why an update did not end well.
+#[derive(Clone, Debug, PartialEq, thiserror::Error)]
+pub enum UpdateError {
+    /// The user asked to stop; the weights are those of an unfinished update.
+    #[error("interrupted")]
+    Interrupted,
+    /// The update diverged.
+    #[error("the update diverged: {quantity} is {value}; nothing of it is kept (a lower ppo.learning_rate may help)")]
+    NotFinite {
+        /// What is not finite.
+        quantity: &'static str,
+        /// Its value.
+        value: f64,
+    },
+}
+
+/// Runs the passes of one epoch over `batch`, changing `policy` and `adam`.
+///
+/// # Errors
+/// The update was interrupted or diverged; the weights must then be thrown away.
+pub fn update(
+    policy: &Policy,
+    adam: &mut Adam,
+    (batch, old): (&Batch, &OldPolicy),
+    (ppo, schedule): (&Ppo, Schedule),
+    rng: &mut EpisodeRng,
+    interrupted: &dyn Fn() -> bool,
+) -> Result<UpdateMeans, UpdateError> {
+    let mut totals = Totals::new(policy.device());
+    for _ in 0..ppo.passes {
+        for episodes in minibatches(&batch.lengths, ppo.minibatch_steps, rng) {
+            if interrupted() {
+                return Err(UpdateError::Interrupted);
+            }
+            let minibatch = Minibatch::new(batch, old, &episodes, policy);
+            let outputs = policy.scan(&minibatch.features, &minibatch.packing, ppo.bptt);
+            let computed_steps = outputs.computed_steps;
+            let scores = policy.distribution().evaluate(
+                &outputs.params,
+                &minibatch.old_params,
+                &minibatch.actions.0,
+                &minibatch.actions.1,
+            );
+
+            let ratio = (scores.log_prob - &minibatch.old_log_probs).exp();
+            let advantages = &minibatch.advantages;
+            let clipped = ratio.clamp(1.0 - ppo.clip, 1.0 + ppo.clip) * advantages;
+            let policy_loss = -(ratio * advantages).minimum(&clipped).mean(Kind::Float);
+            let squared_error = (&outputs.values - &minibatch.targets).square();
+            let value_loss = squared_error.clamp_max(ppo.value_clip).mean(Kind::Float);
+            let entropy = scores.entropy.mean(Kind::Float);
+            let kl = scores.kl.mean(Kind::Float);
+            let loss =
+                &policy_loss + &value_loss * ppo.value_coef - &entropy * ppo.entropy_coef + &kl * schedule.kl_coef;
+
+            adam.zero_grad();
+            outputs.backward(&loss);
+            let grad_norm = adam.step(schedule.learning_rate);
+            let means = [&policy_loss, &value_loss, &kl, &entropy, &grad_norm];
+            totals.add(&means, minibatch.packing.rows(), computed_steps);
+        }
+    }
+    totals.means()
+}
+
+/// What changes from epoch to epoch.
+#[derive(Clone, Copy, Debug)]
+pub struct Schedule {
+    /// Adam's learning rate.
+    pub learning_rate: f64,
+    /// Coefficient of the KL term.
+    pub kl_coef: f64,
+}
+
+/// The KL coefficient of the next epoch, given the mean KL of this one's update: half again as large above twice the
+/// target, half below half of it (Schulman et al., 2017, section 4, with RLlib's factors).
+pub fn next_kl_coef(kl_coef: f64, kl: f64, kl_target: f64) -> f64 {
+    if kl > 2.0 * kl_target {
+        1.5 * kl_coef
+    } else if kl < 0.5 * kl_target {
+        0.5 * kl_coef
+    } else {
+        kl_coef
+    }
+}
+
+/// Whole episodes, shuffled, cut into parts of about `budget` steps; every episode is in exactly one.
+///
+/// There are round(steps / budget) parts (1 at least), as equal as whole episodes allow: an episode belongs to the part
+/// in which its middle falls when all are laid end to end.
+pub fn minibatches(lengths: &[i64], budget: i64, rng: &mut EpisodeRng) -> Vec<Vec<usize>> {
+    let mut order: Vec<usize> = (0..lengths.len()).collect();
+    for last in (1..order.len()).rev() {
+        order.swap(last, popgym_envs::rng::below(rng, last as u32 + 1) as usize);
+    }
+    let total: i64 = lengths.iter().sum();
+    let parts = ((total + budget / 2) / budget).clamp(1, lengths.len() as i64);
+    let mut minibatches = vec![Vec::new(); parts as usize];
+    let mut before = 0;
+    for episode in order {
+        let middle = before + lengths[episode] / 2;
+        minibatches[(middle * parts / total) as usize].push(episode);
+        before += lengths[episode];
+    }
+    minibatches.retain(|episodes| !episodes.is_empty());
+    minibatches
+}
+
+/// One minibatch, packed.
+struct Minibatch {
+    packing: Packing,
+    features: Tensor,
+    actions: (Tensor, Tensor),
+    old_params: Tensor,
+    old_log_probs: Tensor,
+    advantages: Tensor,
+    targets: Tensor,
+}
+
+impl Minibatch {
+    fn new(batch: &Batch, old: &OldPolicy, episodes: &[usize], policy: &Policy) -> Self {
+        let lengths: Vec<i64> = episodes.iter().map(|&episode| batch.lengths[episode]).collect();
+        let starts: Vec<i64> = episodes.iter().map(|&episode| batch.starts[episode]).collect();
+        let packing = Packing::new(&lengths);
+        let index = packing.gather_index(&starts, policy.device());
+        Self {
+            features: batch.features(policy.encoder(), &index),
+            actions: batch.actions(&index),
+            old_params: old.params.index_select(0, &index),
+            old_log_probs: old.log_probs.index_select(0, &index),
+            advantages: old.advantages.index_select(0, &index),
+            targets: old.targets.index_select(0, &index),
+            packing,
+        }
+    }
+}
+
+/// Sums of the reported quantities, kept on the device so that no minibatch waits for it.
+struct Totals {
+    sums: Tensor,
+    steps: i64,
+    computed_steps: i64,
+}
+
+impl Totals {
+    fn new(device: Device) -> Self {
+        Self { sums: Tensor::zeros([5], (Kind::Double, device)), steps: 0, computed_steps: 0 }
+    }
+
+    fn add(&mut self, means: &[&Tensor; 5], steps: i64, computed_steps: i64) {
+        tch::no_grad(|| self.sums += Tensor::stack(means, 0).to_kind(Kind::Double) * steps as f64);
+        self.steps += steps;
+        self.computed_steps += computed_steps;
+    }
+
+    fn means(self) -> Result<UpdateMeans, UpdateError> {
+        let means = Vec::<f64>::try_from((self.sums / self.steps as f64).to_device(Device::Cpu))
+            .expect("five f64 numbers on the CPU are a vector");
+        let names = ["policy loss", "value loss", "KL", "entropy", "gradient norm"];
+        if let Some((quantity, &value)) = names.into_iter().zip(&means).find(|(_, value)| !value.is_finite()) {
+            return Err(UpdateError::NotFinite { quantity, value });
+        }
+        Ok(UpdateMeans {
+            policy_loss: means[0],
+            value_loss: means[1],
+            kl: means[2],
+            entropy: means[3],
+            grad_norm: means[4],
+            valid_fraction: self.steps as f64 / self.computed_steps as f64,
+        })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use popgym_envs::{Purpose, stream};
+    use proptest::prelude::*;
+
+    use super::{minibatches, next_kl_coef};
+
+    #[test]
+    fn kl_coefficient_follows_the_reference() {
+        let near = |a: f64, b: f64| (a - b).abs() < 1e-12;
+        assert!(near(next_kl_coef(0.2, 0.021, 0.01), 0.3));
+        assert!(near(next_kl_coef(0.2, 0.020, 0.01), 0.2));
+        assert!(near(next_kl_coef(0.2, 0.005, 0.01), 0.2));
+        assert!(near(next_kl_coef(0.2, 0.0049, 0.01), 0.1));
+    }
+
+    proptest! {
+        #[test]
+        fn every_episode_is_in_one_minibatch(
+            lengths in proptest::collection::vec(1..300i64, 1..80), budget in 1..5000i64, seed in 0..1000u64,
+        ) {
+            let mut rng = stream(seed, 0, 0, Purpose::Shuffle);
+            let parts = minibatches(&lengths, budget, &mut rng);
+            let mut seen: Vec<usize> = parts.concat();
+            seen.sort_unstable();
+            prop_assert_eq!(seen, (0..lengths.len()).collect::<Vec<_>>());
+            // A part is the budget, give or take what rounding to whole parts and whole episodes makes of it.
+            let longest = lengths.iter().max().unwrap();
+            for part in &parts {
+                let steps: i64 = part.iter().map(|&episode| lengths[episode]).sum();
+                prop_assert!(steps <= budget + budget / 2 + 2 * longest + 1);
+            }
+        }
+    }
+}

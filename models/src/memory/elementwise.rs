@@ -1,0 +1,104 @@
+//! Elementwise arithmetic in plain Rust on the numbers of CPU tensors, for the loops of recurrent memories.
+//!
+//! Multiplications and additions are never fused, so the bits of a result depend on neither the instruction set nor on
+//! whether a number is handled by a vector body or its scalar tail.
+
+use std::ops::Range;
+
+use tch::{Device, Kind, Tensor};
+
+/// The numbers of `rows` of a contiguous f32 tensor `[rows, width]` (or of all of a vector) on the CPU.
+#[allow(unsafe_code)]
+pub(super) fn floats(tensor: &Tensor) -> &[f32] {
+    check(tensor);
+    // SAFETY: `check` made sure that `numel` f32 numbers lie at `data_ptr`; they live as long as the tensor does. The
+    // loops here give no other reference to a tensor while they write to its numbers.
+    unsafe { std::slice::from_raw_parts(tensor.data_ptr().cast(), tensor.numel()) }
+}
+
+/// As [`floats`], to be written. The caller knows that nothing else looks at these numbers meanwhile.
+#[allow(unsafe_code)]
+pub(super) fn floats_mut(tensor: &mut Tensor) -> &mut [f32] {
+    check(tensor);
+    // SAFETY: as in `floats`.
+    unsafe { std::slice::from_raw_parts_mut(tensor.data_ptr().cast(), tensor.numel()) }
+}
+
+fn check(tensor: &Tensor) {
+    assert!(tensor.kind() == Kind::Float && tensor.device() == Device::Cpu && tensor.is_contiguous());
+}
+
+/// `range` of rows that are `width` wide, as a range of numbers.
+pub(super) fn rows(range: &Range<usize>, width: usize) -> Range<usize> {
+    range.start * width..range.end * width
+}
+
+/// Defines a function that runs `$body`, an `#[inline(always)]` function, compiled for the widest vectors that the machine
+/// has.
+macro_rules! widest {
+    ($(#[$attribute:meta])* fn $name:ident($($argument:ident: $kind:ty),* $(,)?) = $body:path) => {
+        $(#[$attribute])*
+        #[allow(unsafe_code)]
+        fn $name($($argument: $kind),*) {
+            #[cfg(target_arch = "x86_64")]
+            {
+                #[target_feature(enable = "avx512f")]
+                fn avx512($($argument: $kind),*) {
+                    $body($($argument),*);
+                }
+                #[target_feature(enable = "avx2")]
+                fn avx2($($argument: $kind),*) {
+                    $body($($argument),*);
+                }
+                if std::arch::is_x86_feature_detected!("avx512f") {
+                    // SAFETY: the machine has these instructions.
+                    return unsafe { avx512($($argument),*) };
+                }
+                if std::arch::is_x86_feature_detected!("avx2") {
+                    // SAFETY: the machine has these instructions.
+                    return unsafe { avx2($($argument),*) };
+                }
+            }
+            $body($($argument),*);
+        }
+    };
+}
+pub(super) use widest;
+
+/// `1 / (1 + exp(-x))`, within 2e-7.
+#[inline(always)]
+pub(super) fn sigmoid(x: f32) -> f32 {
+    1.0 / (1.0 + exp(-x))
+}
+
+/// Hyperbolic tangent, within 2e-7.
+#[inline(always)]
+pub(super) fn tanh(x: f32) -> f32 {
+    2.0 / (1.0 + exp(-2.0 * x)) - 1.0
+}
+
+/// `exp(x)` for `x` clamped to +-87, relative error below 2e-7; NaN stays NaN. No branch and no table, so that loops over
+/// it are vectorised: `exp(x) = 2^k exp(r)` with `k = round(x / ln 2)`, and a polynomial for `exp(r)`, `|r| <= ln(2) / 2`
+/// (Cephes, expf.c).
+#[inline(always)]
+fn exp(x: f32) -> f32 {
+    /// Added to a small number, leaves its nearest integer in the low bits.
+    const ROUND: f32 = 12_582_912.0;
+    // ln 2 in two parts; the product of `k` and the first is exact.
+    const LN_2_HIGH: f32 = 0.693_359_4;
+    const LN_2_LOW: f32 = -2.121_944_4e-4;
+    // Not min and max, which would lose a NaN.
+    let x = if x > 87.0 { 87.0 } else { x };
+    let x = if x < -87.0 { -87.0 } else { x };
+    let shifted = x * std::f32::consts::LOG2_E + ROUND;
+    let k = shifted - ROUND;
+    let r = x - k * LN_2_HIGH - k * LN_2_LOW;
+    let mut p = 1.987_569_1e-4;
+    p = p * r + 1.398_2e-3;
+    p = p * r + 8.333_452e-3;
+    p = p * r + 4.166_579_6e-2;
+    p = p * r + 1.666_666_5e-1;
+    p = p * r + 0.5;
+    let exp_r = p * (r * r) + r + 1.0;
+    exp_r * f32::from_bits((shifted.to_bits() << 23).wrapping_add(0x3f80_0000))
+}

@@ -1,0 +1,68 @@
+//! `mlp`: no memory at all, the baseline that cannot remember (paper: MLP).
+//!
+//! `y = LeakyReLU(W2 LeakyReLU(W1 x + b1) + b2)`, `W1 [hidden, inputs]`, `W2 [hidden, hidden]`; the state is empty.
+
+use serde::{Deserialize, Serialize};
+use tch::nn::Path;
+use tch::{Device, Tensor};
+
+use super::{Memory, MemoryKind, Scan, State};
+use crate::init::{Linear, leaky_relu, uniform};
+use crate::packing::Packing;
+
+/// Options of [`Mlp`].
+#[derive(Clone, Debug, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Options {
+    /// Width of both layers; the paper's is 256.
+    pub hidden_size: i64,
+}
+
+impl Default for Options {
+    fn default() -> Self {
+        Self { hidden_size: 256 }
+    }
+}
+
+/// Two layers on the present input.
+#[derive(Debug)]
+pub struct Mlp {
+    hidden_size: i64,
+    first: Linear,
+    second: Linear,
+}
+
+impl MemoryKind for Mlp {
+    const NAME: &'static str = "mlp";
+    const PAPER_NAME: &'static str = "MLP";
+    type Options = Options;
+
+    fn new(path: &Path<'_>, input_width: i64, options: &Options) -> Result<Self, String> {
+        let hidden_size = super::check_size("hidden_size", options.hidden_size)?;
+        Ok(Self {
+            hidden_size,
+            first: Linear::new(&(path / "first"), input_width, hidden_size, uniform(input_width)),
+            second: Linear::new(&(path / "second"), hidden_size, hidden_size, uniform(hidden_size)),
+        })
+    }
+}
+
+impl Memory for Mlp {
+    fn output_width(&self) -> i64 {
+        self.hidden_size
+    }
+
+    fn initial_state(&self, _rows: i64, _device: Device) -> State {
+        State::default()
+    }
+
+    fn step(&self, input: &Tensor, _state: &State) -> (Tensor, State) {
+        let hidden = leaky_relu(&self.first.forward(input));
+        (leaky_relu(&self.second.forward(&hidden)), State::default())
+    }
+
+    fn scan(&self, input: &Tensor, packing: &Packing, state: &State) -> Scan {
+        let (output, state) = self.step(input, state);
+        Scan { output, state, computed_steps: packing.rows(), backward: None }
+    }
+}

@@ -1,0 +1,215 @@
+//! Memories: the recurrent core of a policy, in two forms of one function.
+//!
+//! - [`Memory::step`]: one time step for a batch of rows; what actors run;
+//! - [`Memory::scan`]: whole packed sequences, in the most parallel form the mathematics allows; what the learner runs.
+//!
+//! Both agree within `1e-5 max(1, largest |output|)`. To add a memory, copy `gru.rs` and add one line to
+//! [`Registry::standard`]; the tests of this crate then run on it without being told.
+
+use std::sync::Arc;
+
+use serde::Serialize;
+use serde::de::DeserializeOwned;
+use tch::nn::Path;
+use tch::{Device, Tensor};
+
+use crate::ModelError;
+use crate::packing::Packing;
+
+mod elementwise;
+mod gru;
+mod gru_cpu;
+mod mlp;
+
+pub use gru::Gru;
+pub use mlp::Mlp;
+
+/// The recurrent state of a batch: tensors with one row a sequence (`[rows, ...]`).
+#[derive(Debug, Default)]
+pub struct State(pub Vec<Tensor>);
+
+impl State {
+    /// Sets these rows to zero, the state at the start of an episode.
+    pub fn reset_rows(&mut self, rows: &[i64]) {
+        if rows.is_empty() {
+            return;
+        }
+        for tensor in &mut self.0 {
+            let index = Tensor::from_slice(rows).to_device(tensor.device());
+            let _ = tensor.index_fill_(0, &index, 0.0);
+        }
+    }
+
+    /// The state with just these rows, in this order.
+    pub fn select(&self, rows: &[i64]) -> State {
+        State(
+            self.0
+                .iter()
+                .map(|tensor| tensor.index_select(0, &Tensor::from_slice(rows).to_device(tensor.device())))
+                .collect(),
+        )
+    }
+
+    /// The state's first `rows` rows, cut off from the graph that computed them.
+    pub(crate) fn carry(&self, rows: i64) -> State {
+        State(self.0.iter().map(|tensor| tensor.narrow(0, 0, rows).detach()).collect())
+    }
+}
+
+/// Takes d loss / d output `[rows, output width]`, adds to the memory's own parameter gradients, and returns
+/// d loss / d input `[rows, input width]`.
+pub type Backward = Box<dyn FnOnce(&Tensor) -> Tensor>;
+
+/// What [`Memory::scan`] returns.
+pub struct Scan {
+    /// Outputs of all packed rows, `[rows, output width]`.
+    pub output: Tensor,
+    /// State of each sequence after its last step, in packed order.
+    pub state: State,
+    /// Time steps computed; more than the packed rows where a memory pads.
+    pub computed_steps: i64,
+    /// The memory's own backward, for one that does not leave it to autograd. `output` is then detached.
+    pub backward: Option<Backward>,
+}
+
+/// A memory: a function of an input sequence, step by step or all at once.
+pub trait Memory: Send {
+    /// Width of an output vector.
+    fn output_width(&self) -> i64;
+
+    /// The state before the first step, all zeros, for `rows` sequences.
+    fn initial_state(&self, rows: i64, device: Device) -> State;
+
+    /// One time step: `input [rows, input width]` to `output [rows, output width]` and the next state.
+    fn step(&self, input: &Tensor, state: &State) -> (Tensor, State);
+
+    /// Whole sequences: packed `input [rows, input width]`; `state` before their first step, in packed order.
+    fn scan(&self, input: &Tensor, packing: &Packing, state: &State) -> Scan;
+}
+
+/// A kind of memory that can be built by name.
+pub trait MemoryKind: Memory + Sized + 'static {
+    /// Its name in configurations, for example `gru`.
+    const NAME: &'static str;
+    /// Its name in the paper's tables, for example `GRU`.
+    const PAPER_NAME: &'static str;
+    /// Its options: the keys of the configuration's `[memory]` table beside `name`.
+    type Options: Serialize + DeserializeOwned + Default;
+
+    /// A memory with fresh weights below `path`.
+    ///
+    /// # Errors
+    /// Which option is impossible, its value, and what is allowed.
+    fn new(path: &Path<'_>, input_width: i64, options: &Self::Options) -> Result<Self, String>;
+}
+
+type Build = dyn Fn(&Path<'_>, i64, &toml::Table) -> Result<Box<dyn Memory>, String> + Send + Sync;
+type Resolve = dyn Fn(&toml::Table) -> Result<toml::Table, String> + Send + Sync;
+
+/// A memory's entry in the [`Registry`].
+#[derive(Clone)]
+pub struct Entry {
+    /// Its name in configurations.
+    pub name: &'static str,
+    /// Its name in the paper's tables.
+    pub paper_name: &'static str,
+    build: Arc<Build>,
+    resolve: Arc<Resolve>,
+}
+
+impl Entry {
+    /// The options with every default filled in.
+    ///
+    /// # Errors
+    /// The key that is unknown or has a wrong type.
+    pub fn resolve(&self, options: &toml::Table) -> Result<toml::Table, ModelError> {
+        (self.resolve)(options).map_err(|problem| self.options_error(problem))
+    }
+
+    /// A memory with fresh weights below `path`.
+    ///
+    /// # Errors
+    /// The option that is wrong.
+    pub fn build(
+        &self,
+        path: &Path<'_>,
+        input_width: i64,
+        options: &toml::Table,
+    ) -> Result<Box<dyn Memory>, ModelError> {
+        (self.build)(path, input_width, options).map_err(|problem| self.options_error(problem))
+    }
+
+    fn options_error(&self, problem: String) -> ModelError {
+        ModelError::MemoryOptions { memory: self.name.to_owned(), problem }
+    }
+}
+
+/// The memories that can be named.
+#[derive(Clone, Default)]
+pub struct Registry {
+    entries: Vec<Entry>,
+}
+
+impl Registry {
+    /// The memories of this crate.
+    pub fn standard() -> Self {
+        let mut registry = Self::default();
+        registry.register::<Mlp>();
+        registry.register::<Gru>();
+        registry
+    }
+
+    /// Adds a kind of memory; one of the same name is replaced.
+    pub fn register<M: MemoryKind>(&mut self) {
+        self.entries.retain(|entry| entry.name != M::NAME);
+        self.entries.push(Entry {
+            name: M::NAME,
+            paper_name: M::PAPER_NAME,
+            build: Arc::new(|path, input_width, options| {
+                M::new(path, input_width, &parse::<M>(options)?).map(|memory| Box::new(memory) as Box<dyn Memory>)
+            }),
+            resolve: Arc::new(|options| toml::Table::try_from(parse::<M>(options)?).map_err(|error| error.to_string())),
+        });
+    }
+
+    /// All entries, in the order of registration.
+    pub fn entries(&self) -> &[Entry] {
+        &self.entries
+    }
+
+    /// The entry called `name`.
+    ///
+    /// # Errors
+    /// An unknown name, with the nearest known one.
+    pub fn get(&self, name: &str) -> Result<&Entry, ModelError> {
+        self.entries.iter().find(|entry| entry.name == name).ok_or_else(|| {
+            let nearest = self
+                .entries
+                .iter()
+                .max_by(|a, b| strsim::jaro_winkler(a.name, name).total_cmp(&strsim::jaro_winkler(b.name, name)));
+            ModelError::UnknownMemory {
+                name: name.to_owned(),
+                nearest: nearest.map_or_else(String::new, |entry| entry.name.to_owned()),
+            }
+        })
+    }
+}
+
+fn parse<M: MemoryKind>(options: &toml::Table) -> Result<M::Options, String> {
+    options.clone().try_into().map_err(|error: toml::de::Error| error.message().trim().to_owned())
+}
+
+/// Adds to the parameters' gradients as autograd would: for a memory with a backward of its own.
+fn add_gradients(parameters: &[&Tensor], gradients: &[Tensor]) {
+    // tch cannot set a gradient; but d (p . g) / dp = g.
+    let products = parameters.iter().zip(gradients).filter(|(parameter, _)| parameter.requires_grad());
+    let products = products.map(|(parameter, gradient)| parameter.view(-1).dot(&gradient.view(-1)));
+    if let Some(sum) = products.reduce(|a, b| a + b) {
+        sum.backward();
+    }
+}
+
+/// A width or size option: 1 to 65,536.
+fn check_size(key: &str, value: i64) -> Result<i64, String> {
+    if (1..=65_536).contains(&value) { Ok(value) } else { Err(format!("`{key}` is {value}, allowed is 1..=65536")) }
+}
