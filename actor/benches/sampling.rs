@@ -9,12 +9,13 @@ use std::time::{Duration, Instant};
 
 use popgym_actor::{Rollout, worker};
 use popgym_models::memory;
-use popgym_proto::RunSpec;
+use popgym_proto::{Episode, RunSpec};
 use prost::Message as _;
 use tch::{Device, Kind, Tensor};
 
-const WARM_UP: Duration = Duration::from_millis(500);
-const MEASURE: Duration = Duration::from_secs(3);
+/// Both rates are measured in turns, so that whatever else the machine does meets both.
+const ROUNDS: u32 = 6;
+const ROUND: Duration = Duration::from_millis(500);
 
 fn main() -> anyhow::Result<()> {
     tch::set_num_threads(1);
@@ -29,9 +30,17 @@ fn main() -> anyhow::Result<()> {
     );
     for rows in [16, 64, 128, 256, 512] {
         let mut rollout = rollout(&memory, &env, rows)?;
-        let act = act_rate(&rollout, rows);
-        let (steps, bytes) = sampling_rate(&mut rollout);
-        let ratio = 100.0 * steps / act;
+        let mut sampler = Sampler::default();
+        let (mut act, mut steps) = (0.0, 0.0);
+        for round in 0..=ROUNDS {
+            let rates = (act_rate(&rollout, rows), sampler.rate(&mut rollout));
+            // The first warms up.
+            if round > 0 {
+                act += rates.0 / f64::from(ROUNDS);
+                steps += rates.1 / f64::from(ROUNDS);
+            }
+        }
+        let (ratio, bytes) = (100.0 * steps / act, sampler.bytes as f64 / sampler.sent_steps.max(1) as f64);
         println!("{rows:>5} {act:>16.0} {steps:>16.0} {ratio:>6.1}% {bytes:>12.1} {:>10.0}", resident_mib());
     }
     Ok(())
@@ -63,39 +72,41 @@ fn act_rate(rollout: &Rollout, rows: u32) -> f64 {
     let policy = rollout.policy();
     let features = Tensor::randn([i64::from(rows), policy.encoder().width() as i64], (Kind::Float, Device::Cpu));
     let mut state = policy.initial_state(i64::from(rows));
-    let mut act = |time: Duration| {
-        let (begun, mut calls) = (Instant::now(), 0_u32);
-        while begun.elapsed() < time {
-            (_, state) = policy.act(&features, &state);
-            calls += 1;
-        }
-        f64::from(calls) * f64::from(rows) / begun.elapsed().as_secs_f64()
-    };
-    act(WARM_UP);
-    act(MEASURE)
+    let (begun, mut calls) = (Instant::now(), 0_u32);
+    while begun.elapsed() < ROUND {
+        (_, state) = policy.act(&features, &state);
+        calls += 1;
+    }
+    f64::from(calls) * f64::from(rows) / begun.elapsed().as_secs_f64()
 }
 
-/// Environment steps a second of the whole loop, and bytes a step on the wire.
-fn sampling_rate(rollout: &mut Rollout) -> (f64, f64) {
-    let (mut next, mut finished) = (0_u64, Vec::new());
-    let mut sample = |time: Duration| {
-        let (begun, mut steps, mut sent, mut bytes) = (Instant::now(), 0_usize, 0_usize, 0_usize);
-        while begun.elapsed() < time {
-            if rollout.waiting() < 64 {
-                rollout.lease(next..next + 1024);
-                next += 1024;
+/// The whole loop, with leases without end.
+#[derive(Default)]
+struct Sampler {
+    next_lease: u64,
+    finished: Vec<Episode>,
+    sent_steps: usize,
+    bytes: usize,
+}
+
+impl Sampler {
+    /// Environment steps a second.
+    fn rate(&mut self, rollout: &mut Rollout) -> f64 {
+        let (begun, mut steps) = (Instant::now(), 0);
+        while begun.elapsed() < ROUND {
+            if rollout.waiting() <= rollout.live() {
+                rollout.lease(self.next_lease..self.next_lease + 1024);
+                self.next_lease += 1024;
             }
-            rollout.step(&mut finished);
-            steps += rollout.live() + finished.len();
-            sent += finished.iter().map(|episode| episode.steps).sum::<usize>();
-            for message in worker::messages(0, 0, &mut finished) {
-                bytes += message.encode_to_vec().len();
+            rollout.step(&mut self.finished);
+            steps += rollout.live() + self.finished.len();
+            self.sent_steps += self.finished.iter().map(|episode| episode.steps).sum::<usize>();
+            for message in worker::messages(0, 0, &mut self.finished) {
+                self.bytes += message.encode_to_vec().len();
             }
         }
-        (steps as f64 / begun.elapsed().as_secs_f64(), bytes as f64 / sent.max(1) as f64)
-    };
-    sample(WARM_UP);
-    sample(MEASURE)
+        steps as f64 / begun.elapsed().as_secs_f64()
+    }
 }
 
 /// Resident memory of this process.

@@ -29,6 +29,7 @@ pub mod service;
 pub mod session;
 pub mod trainer;
 pub mod update;
+pub mod waiting;
 
 use std::ffi::OsString;
 use std::io::IsTerminal;

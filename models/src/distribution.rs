@@ -123,9 +123,9 @@ impl ActionDistribution {
             let log_p = params.narrow(1, at, classes as i64).log_softmax(-1, Kind::Float);
             let old_log_p = old_params.narrow(1, at, classes as i64).log_softmax(-1, Kind::Float);
             let chosen = discrete.narrow(1, component as i64, 1);
-            sum.log_prob = sum.log_prob + log_p.gather(1, &chosen, false).squeeze_dim(1);
-            sum.entropy = sum.entropy - (log_p.exp() * &log_p).sum_dim_intlist(1, false, Kind::Float);
-            sum.kl = sum.kl + (old_log_p.exp() * (old_log_p - log_p)).sum_dim_intlist(1, false, Kind::Float);
+            sum.log_prob += log_p.gather(1, &chosen, false).squeeze_dim(1);
+            sum.entropy -= (log_p.exp() * &log_p).sum_dim_intlist(1, false, Kind::Float);
+            sum.kl += (old_log_p.exp() * (old_log_p - log_p)).sum_dim_intlist(1, false, Kind::Float);
             at += classes as i64;
         }
         if !self.bounds.is_empty() {
@@ -139,9 +139,9 @@ impl ActionDistribution {
             let shift = (&old_mean - &mean) * (-&log_std).exp();
             let kl = (variance_ratio + shift.square() - 1.0) * 0.5 + &log_std - &old_log_std;
             let total = |x: Tensor| x.sum_dim_intlist(1, false, Kind::Float);
-            sum.log_prob = sum.log_prob + total(log_prob);
-            sum.entropy = sum.entropy + total(entropy);
-            sum.kl = sum.kl + total(kl);
+            sum.log_prob += total(log_prob);
+            sum.entropy += total(entropy);
+            sum.kl += total(kl);
         }
         sum
     }

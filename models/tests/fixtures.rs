@@ -8,8 +8,10 @@ use popgym_models::Packing;
 use serde_json::Value;
 use tch::{Device, Kind, Tensor};
 
+type Case = (&'static str, &'static str, &'static [(&'static str, &'static str)]);
+
 /// Memory (the recorded case has its name), its options, and for each of upstream's parameters ours.
-const CASES: [(&str, &str, &[(&str, &str)]); 1] = [(
+const CASES: [Case; 1] = [(
     "gru",
     "hidden_size = 8",
     &[
@@ -26,7 +28,9 @@ fn tensor(value: &Value) -> Tensor {
             if shape.len() == depth {
                 shape.push(list.len() as i64);
             }
-            list.iter().for_each(|value| walk(value, depth + 1, shape, numbers));
+            for value in list {
+                walk(value, depth + 1, shape, numbers);
+            }
         } else {
             numbers.push(value.as_f64().expect("a number"));
         }

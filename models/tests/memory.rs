@@ -95,7 +95,7 @@ fn gradients_agree_with_differences() {
             let length = gradient.norm().double_value(&[]);
             let direction = gradient * (STEP / length);
             let moved = |sign: f64| {
-                tch::no_grad(|| parameters[key].shallow_clone().g_add_(&(&direction * sign)));
+                let _ = tch::no_grad(|| parameters[key].shallow_clone().g_add_(&(&direction * sign)));
                 loss(&x)
             };
             let difference = moved(1.0) - moved(-2.0);
@@ -111,16 +111,16 @@ fn gradients_add_up_as_autograds_do() {
         let (memory, parameters) = memory(name, WIDTH, "");
         let (packing, x) = pack(&sequences(&[5, 9], WIDTH));
         let weight = random(packing.rows(), memory.output_width());
-        scan_gradient(&*memory, &x, &packing, &weight);
+        let _ = scan_gradient(&*memory, &x, &packing, &weight);
         let once = take_gradients(&parameters);
-        scan_gradient(&*memory, &x, &packing, &weight);
-        scan_gradient(&*memory, &x, &packing, &weight);
+        let _ = scan_gradient(&*memory, &x, &packing, &weight);
+        let _ = scan_gradient(&*memory, &x, &packing, &weight);
         let twice = take_gradients(&parameters).into_iter().map(|(name, gradient)| (name, gradient / 2.0)).collect();
         assert_gradients_close(&twice, &once, 1e-5, name);
         // A frozen parameter gets none, and the others theirs.
         let frozen = parameters.keys().next().unwrap();
         let _ = parameters[frozen].set_requires_grad(false);
-        scan_gradient(&*memory, &x, &packing, &weight);
+        let _ = scan_gradient(&*memory, &x, &packing, &weight);
         for (key, parameter) in &parameters {
             let expected = if key == frozen { 0.0 } else { largest(&once[key]) };
             assert!((largest(&parameter.grad()) - expected).abs() <= 1e-5 * expected, "{name} {key}");
@@ -158,7 +158,7 @@ fn the_gru_has_the_gradients_of_its_equations() {
             let mut h = Tensor::zeros([1, hidden], FLOAT);
             for t in 0..sequence.size()[0] {
                 h = gru_step(&parameters, "", &sequence.narrow(0, t, 1), &h);
-                loss = loss + (&h * weight.narrow(0, t, 1)).sum(Kind::Float);
+                loss += (&h * weight.narrow(0, t, 1)).sum(Kind::Float);
             }
         }
         loss.backward();

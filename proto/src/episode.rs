@@ -133,11 +133,11 @@ impl Episode {
             // At most `MAX_EPISODE_STEPS` in any episode that is sent; the other side checks it.
             steps: u32::try_from(self.steps).unwrap_or(u32::MAX),
             observations_discrete: self.observations.discrete,
-            observations_real: le_bytes(&self.observations.real, |x| x.to_le_bytes()),
+            observations_real: le_bytes(&self.observations.real, f32::to_le_bytes),
             actions_discrete: self.actions.discrete,
-            actions_real: le_bytes(&self.actions.real, |x| x.to_le_bytes()),
-            rewards: le_bytes(&self.rewards, |x| x.to_le_bytes()),
-            log_probs: le_bytes(&self.log_probs, |x| x.to_le_bytes()),
+            actions_real: le_bytes(&self.actions.real, f32::to_le_bytes),
+            rewards: le_bytes(&self.rewards, f64::to_le_bytes),
+            log_probs: le_bytes(&self.log_probs, f32::to_le_bytes),
             terminated: self.terminated,
             truncated: self.truncated,
         }

@@ -59,7 +59,7 @@ pub const CONNECT_DEADLINE: Duration = Duration::from_secs(5);
 pub const HELLO_DEADLINE: Duration = Duration::from_secs(10);
 
 /// An actor that was welcomed is ready within this: it builds environments and policy (a second; more on a busy machine).
-pub const READY_DEADLINE: Duration = Duration::from_secs(120);
+pub const READY_DEADLINE: Duration = Duration::from_mins(2);
 
 /// Each side sends something at least this often.
 pub const HEARTBEAT_INTERVAL: Duration = Duration::from_secs(5);

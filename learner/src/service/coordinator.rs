@@ -53,7 +53,7 @@ struct Session {
 }
 
 struct Epoch {
-    epoch: u64,
+    number: u64,
     weights: WeightSet,
     target: Target,
     opened: Instant,
@@ -180,7 +180,7 @@ impl Coordinator {
         let version = epoch.weights.version;
         let weights = (session.version != Some(version)).then(|| epoch.weights.clone());
         session.version = Some(version);
-        let order = Order::Open(OpenEpoch { epoch: epoch.epoch, version, weights });
+        let order = Order::Open(OpenEpoch { epoch: epoch.number, version, weights });
         self.order(id, order);
     }
 
@@ -230,7 +230,7 @@ impl Coordinator {
         }
         self.shared.prefix_steps.store(0, Ordering::Relaxed);
         self.epoch = Some(Epoch {
-            epoch,
+            number: epoch,
             weights,
             target,
             opened: Instant::now(),
@@ -251,7 +251,7 @@ impl Coordinator {
     /// Keeps the episodes that are leased to this session; counts and drops the others.
     fn receive(&mut self, id: u64, batch: EpisodeBatch) {
         let Some(session) = self.sessions.get_mut(&id) else { return };
-        let Some(epoch) = self.epoch.as_mut().filter(|epoch| epoch.epoch == batch.epoch) else {
+        let Some(epoch) = self.epoch.as_mut().filter(|epoch| epoch.number == batch.epoch) else {
             return metrics::refused("late", batch.episodes.len());
         };
         if batch.version != epoch.weights.version {
@@ -274,7 +274,7 @@ impl Coordinator {
     fn close_if_complete(&mut self) {
         let Some(epoch) = self.epoch.take_if(|epoch| epoch.is_complete()) else { return };
         self.length = LengthEstimate::next_epoch(epoch.prefix_steps as f64 / epoch.prefix.max(1) as f64);
-        let number = epoch.epoch;
+        let number = epoch.number;
         self.order_all(|session| (!session.held.is_empty()).then_some(Order::Close { epoch: number }));
         for session in self.sessions.values_mut() {
             session.held.clear();
@@ -304,7 +304,7 @@ impl Coordinator {
             epoch.holders.insert(index, session);
             leases.entry(session).or_default().push(index);
         }
-        let number = epoch.epoch;
+        let number = epoch.number;
         for (id, episodes) in leases {
             if let Some(session) = self.sessions.get_mut(&id) {
                 session.held.extend(&episodes);
@@ -342,7 +342,7 @@ impl Epoch {
     fn into_collected(mut self) -> Collected {
         let surplus = self.received.split_off(&self.prefix);
         Collected {
-            epoch: self.epoch,
+            epoch: self.number,
             version: self.weights.version,
             steps: self.prefix_steps,
             episodes: self.received.into_values().collect(),

@@ -151,10 +151,9 @@ impl Service {
                     self.open.set(None);
                     return Some(collected);
                 }
-                // Of an epoch that was opened over.
-                Ok(_) => {}
                 Err(RecvTimeoutError::Timeout) if interrupted() => return None,
-                Err(RecvTimeoutError::Timeout) => {}
+                // `Ok`: of an epoch that was opened over.
+                Ok(_) | Err(RecvTimeoutError::Timeout) => {}
                 Err(RecvTimeoutError::Disconnected) => return None,
             }
         }

@@ -32,10 +32,18 @@ fn service() -> Service {
     Service::start(TcpListener::bind("127.0.0.1:0").unwrap(), spec, episodes, FINGERPRINT).unwrap()
 }
 
+/// Two epochs whose episodes all have the same length: 1 step, then 40.
+const SHORT: u64 = 1000;
+const LONG: u64 = 1001;
+
 /// Episode `index` of `epoch`, whoever samples it: of 1 to 40 steps.
 fn episode(epoch: u64, index: u64) -> Episode {
     let number = (epoch << 32 | index).wrapping_mul(0x9e37_79b9_7f4a_7c15) >> 17;
-    let steps = 1 + number as usize % MAX_STEPS as usize;
+    let steps = match epoch {
+        SHORT => 1,
+        LONG => MAX_STEPS as usize,
+        _ => 1 + number as usize % MAX_STEPS as usize,
+    };
     let discrete = |rows: usize, classes: u64| Columns {
         discrete: (0..rows as u64).map(|t| ((number + t) % classes) as u8).collect(),
         real: Vec::new(),
@@ -62,6 +70,8 @@ enum Conduct {
     SendsGarbage,
     /// Sends everything twice, and what it does not hold, and what is of another epoch or version.
     SendsTooMuch,
+    /// Sends the first five episodes of every message of leases.
+    SendsFive,
     /// Takes leases, and sends nothing.
     Sits,
 }
@@ -137,18 +147,21 @@ async fn simulate(
                 seen.lock().unwrap().leases.extend(&leases.episodes);
                 let epoch = leases.epoch;
                 let episodes: Vec<Episode> = leases.episodes.iter().map(|&index| self::episode(epoch, index)).collect();
-                let batch = EpisodeBatch { epoch, version, episodes };
+                let mut batch = EpisodeBatch { epoch, version, episodes };
+                if conduct == Conduct::SendsFive {
+                    batch.episodes.truncate(5);
+                }
                 match conduct {
                     Conduct::Sits => {}
                     Conduct::Vanishes => return Ok("vanished".to_owned()),
-                    Conduct::Honest => send(ActorMessage::Episodes(batch)).await,
+                    Conduct::Honest | Conduct::SendsFive => send(ActorMessage::Episodes(batch)).await,
                     Conduct::SendsGarbage => {
                         let mut wire = ActorMessage::Episodes(batch).into_wire();
                         if let Some(wire::from_actor::Message::Episodes(batch)) = &mut wire.message {
                             batch.episodes[0].actions_discrete =
                                 vec![77; batch.episodes[0].actions_discrete.len()].into();
                         }
-                        requests.send(wire).await.unwrap();
+                        drop(requests.send(wire).await);
                     }
                     Conduct::SendsTooMuch => {
                         let other = EpisodeBatch { epoch: epoch + 1, ..batch.clone() };
@@ -340,16 +353,27 @@ fn an_actor_that_connects_anew_replaces_its_older_self() {
 }
 
 #[test]
-fn actors_are_told_that_the_batch_is_complete() {
+fn what_is_under_way_is_called_off_when_the_batch_is_complete() {
+    let service = service();
+    let actors = Actors::of(&service);
+    let actor = actors.spawn("actor", Conduct::SendsFive);
+    // After an epoch of short episodes, far too many of the long ones are leased.
+    service.open(SHORT, 0, WEIGHTS, Target::Episodes(5)).unwrap();
+    assert_eq!(collect(&service).steps, 5);
+    service.open(LONG, 0, WEIGHTS, Target::Steps(5 * u64::from(MAX_STEPS))).unwrap();
+    assert_eq!(collect(&service).episodes, expected(LONG, Target::Episodes(5)));
+    wait_for("the call", || actor.seen.lock().unwrap().closed == [LONG]);
+    assert!(actor.seen.lock().unwrap().leases.len() > 10);
+    assert_eq!(service.actors(), 1);
+}
+
+#[test]
+fn the_end_does_not_wait_for_a_batch() {
     let service = service();
     let actors = Actors::of(&service);
     let sitting = actors.spawn("sitting", Conduct::Sits);
     service.open(0, 0, WEIGHTS, Target::Episodes(4)).unwrap();
     wait_for("leases", || sitting.seen.lock().unwrap().leases.len() == 4);
-    // The estimate of an episode's length starts at the longest; so both hold leases of this epoch.
-    let _honest = actors.spawn("honest", Conduct::Honest);
-    wait_for("two actors", || service.actors() == 2);
-    service.open(1, 0, WEIGHTS, Target::Episodes(4)).unwrap();
     assert!(service.collect(|| true).is_none(), "interrupted");
     service.finish("enough");
     assert_eq!(actors.end(sitting).unwrap(), "enough");

@@ -3,16 +3,18 @@
 //! Multiplications and additions are never fused, so the bits of a result depend on neither the instruction set nor on
 //! whether a number is handled by a vector body or its scalar tail.
 
-use std::ops::Range;
+// Only inlined code is compiled for the caller's instruction set.
+#![allow(clippy::inline_always)]
 
 use tch::{Device, Kind, Tensor};
 
-/// The numbers of `rows` of a contiguous f32 tensor `[rows, width]` (or of all of a vector) on the CPU.
+/// The numbers of a contiguous f32 tensor on the CPU. The caller knows that nothing writes to them meanwhile.
 #[allow(unsafe_code)]
 pub(super) fn floats(tensor: &Tensor) -> &[f32] {
     check(tensor);
-    // SAFETY: `check` made sure that `numel` f32 numbers lie at `data_ptr`; they live as long as the tensor does. The
-    // loops here give no other reference to a tensor while they write to its numbers.
+    // SAFETY: `check` made sure that `numel` f32 numbers lie at `data_ptr`; they live as long as the tensor does. Tensors
+    // may share numbers; the loops over time, the only callers, hold slices of disjoint rows, and only between libtorch's
+    // calls.
     unsafe { std::slice::from_raw_parts(tensor.data_ptr().cast(), tensor.numel()) }
 }
 
@@ -26,11 +28,6 @@ pub(super) fn floats_mut(tensor: &mut Tensor) -> &mut [f32] {
 
 fn check(tensor: &Tensor) {
     assert!(tensor.kind() == Kind::Float && tensor.device() == Device::Cpu && tensor.is_contiguous());
-}
-
-/// `range` of rows that are `width` wide, as a range of numbers.
-pub(super) fn rows(range: &Range<usize>, width: usize) -> Range<usize> {
-    range.start * width..range.end * width
 }
 
 /// Defines a function that runs `$body`, an `#[inline(always)]` function, compiled for the widest vectors that the machine
@@ -101,4 +98,37 @@ fn exp(x: f32) -> f32 {
     p = p * r + 0.5;
     let exp_r = p * (r * r) + r + 1.0;
     exp_r * f32::from_bits((shifted.to_bits() << 23).wrapping_add(0x3f80_0000))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::{exp, sigmoid, tanh};
+
+    #[test]
+    fn functions_are_accurate_and_rise() {
+        let mut before = [f32::NEG_INFINITY; 3];
+        for i in -3_000_000..=3_000_000 {
+            let x = i as f32 * 1e-5;
+            let wide = f64::from(x);
+            let exact = [1.0, 1.0 / (1.0 + (-wide).exp()), wide.tanh()];
+            let found = [exp(x) / wide.exp() as f32, sigmoid(x), tanh(x)];
+            for (function, (found, exact)) in found.iter().zip(exact).enumerate() {
+                assert!((f64::from(*found) - exact).abs() <= 2e-7, "function {function} of {x}: {found}, not {exact}");
+            }
+            for (now, before) in [exp(x), sigmoid(x), tanh(x)].into_iter().zip(&mut before) {
+                assert!(now >= *before - 1.5e-7 * before.abs(), "falls at {x}: from {before} to {now}");
+                *before = now;
+            }
+        }
+    }
+
+    #[test]
+    fn limits_are_exact_and_nan_stays() {
+        for x in [20.0, 100.0, f32::MAX, f32::INFINITY] {
+            assert_eq!((sigmoid(x), tanh(x), tanh(-x)), (1.0, 1.0, -1.0), "{x}");
+            assert!((0.0..3e-9).contains(&sigmoid(-x)), "{x}");
+        }
+        assert_eq!((sigmoid(0.0), tanh(0.0), exp(0.0)), (0.5, 0.0, 1.0));
+        assert!(sigmoid(f32::NAN).is_nan() && tanh(f32::NAN).is_nan());
+    }
 }

@@ -16,13 +16,18 @@
 //! dh = dh' q + ds U
 //! dW = da^T x    dU = ds^T h    db = sum da    dc = sum ds    dx = da W     all rows at once
 //! ```
+//!
+//! The products are libtorch's; the rest is plain Rust (`elementwise.rs`).
+
+// Only inlined code is compiled for the caller's instruction set.
+#![allow(clippy::inline_always)]
 
 use std::ops::Range;
 
 use tch::{Device, Kind, Tensor};
 
-use super::elementwise::{floats, floats_mut, rows, sigmoid, tanh, widest};
-use super::{Scan, State, add_gradients};
+use super::elementwise::{floats, floats_mut, sigmoid, tanh, widest};
+use super::{Backward, Scan, State, add_gradients};
 use crate::packing::Packing;
 
 /// `W [3 hidden, inputs]`, `U [3 hidden, hidden]`, `b`, `c`; gates in the order r, q, n.
@@ -45,44 +50,34 @@ pub(super) fn scan(parameters: Parameters<'_>, input: &Tensor, packing: &Packing
     let keep = input.requires_grad();
     tch::no_grad(|| {
         let [w, u, b, c] = parameters;
-        let (initial, hidden) = (initial.contiguous(), initial.size()[1]);
-        let width = hidden as usize;
+        let hidden = initial.size()[1];
         let transposed = u.tr();
-        let mut a = b.addmm(input, &w.tr());
-        let mut s = empty(if keep { packing.rows() } else { packing.sequences() }, 3 * hidden);
-        let mut output = empty(packing.rows(), hidden);
-        let mut before = 0..0;
+        let a = b.addmm(input, &w.tr());
+        let s = empty(if keep { packing.rows() } else { packing.sequences() }, 3 * hidden);
+        let output = empty(packing.rows(), hidden);
+        let mut before = initial.contiguous();
+        let mut states = Vec::new();
         for now in steps(packing) {
-            let alive = now.len();
-            let s_at = if keep { now.clone() } else { 0..alive };
-            let h = if now.start == 0 {
-                narrow(&initial, &now)
-            } else {
-                narrow(&output, &(before.start..before.start + alive))
-            };
-            let _ = h.mm_out(&narrow(&s, &s_at), &transposed);
-            let (done, next) = floats_mut(&mut output).split_at_mut(now.start * width);
-            let h = if now.start == 0 { floats(&initial) } else { &done[before.start * width..] };
-            forward(
-                &mut floats_mut(&mut a)[rows(&now, 3 * width)],
-                &mut floats_mut(&mut s)[rows(&s_at, 3 * width)],
-                floats(c),
-                &h[..alive * width],
-                &mut next[..alive * width],
-            );
-            before = now;
+            let alive = 0..now.len();
+            let h = narrow(&before, &alive);
+            let (mut a, mut next) = (narrow(&a, &now), narrow(&output, &now));
+            let mut s = narrow(&s, if keep { &now } else { &alive });
+            let _ = h.mm_out(&s, &transposed);
+            forward(floats_mut(&mut a), floats_mut(&mut s), floats(c), floats(&h), floats_mut(&mut next));
+            states.push(h);
+            before = next;
         }
         let last = output.index_select(0, &packing.last_rows());
         let backward = keep.then(|| {
             let tape = Tape {
                 parameters: parameters.map(Tensor::shallow_clone),
-                input: input.detach(),
-                h: previous_states(&initial, &output, packing),
                 steps: steps(packing).collect(),
+                input: input.detach(),
+                h: Tensor::cat(&states, 0),
                 a,
                 s,
             };
-            Box::new(move |grad_output: &Tensor| tape.backward(grad_output)) as super::Backward
+            Box::new(move |grad_output: &Tensor| tape.backward(grad_output)) as Backward
         });
         Scan { output, state: State(vec![last]), computed_steps: packing.rows(), backward }
     })
@@ -97,31 +92,27 @@ struct Tape {
     h: Tensor,
     /// r, q, n; then da.
     a: Tensor,
-    /// Two columns unused, m; then ds.
+    /// Two thirds of no use, m; then ds.
     s: Tensor,
 }
 
 impl Tape {
     /// From d loss / d output to d loss / d input; adds to the parameters' gradients.
-    fn backward(mut self, grad_output: &Tensor) -> Tensor {
+    fn backward(self, grad_output: &Tensor) -> Tensor {
         let [w, u, b, c] = &self.parameters;
         let (gradients, grad_input) = tch::no_grad(|| {
             let grad_output = grad_output.contiguous();
             let hidden = self.h.size()[1];
-            let width = hidden as usize;
-            // d loss / d state after the step, but for what comes through this step's own output.
-            let mut dh = Tensor::zeros([self.steps[0].len() as i64, hidden], (Kind::Float, Device::Cpu));
+            // d loss / d state after the step, but for what comes through the step's own output.
+            let dh = Tensor::zeros([self.steps[0].len() as i64, hidden], (Kind::Float, Device::Cpu));
             for now in self.steps.iter().rev() {
-                backward(
-                    &mut floats_mut(&mut self.a)[rows(now, 3 * width)],
-                    &mut floats_mut(&mut self.s)[rows(now, 3 * width)],
-                    &floats(&self.h)[rows(now, width)],
-                    &floats(&grad_output)[rows(now, width)],
-                    &mut floats_mut(&mut dh)[..now.len() * width],
-                    width,
-                );
+                let (mut a, mut s, mut dh) = (narrow(&self.a, now), narrow(&self.s, now), narrow(&dh, &(0..now.len())));
+                let (h, grad_output) = (narrow(&self.h, now), narrow(&grad_output, now));
+                let (h, grad_output) = (floats(&h), floats(&grad_output));
+                let width = hidden as usize;
+                backward(floats_mut(&mut a), floats_mut(&mut s), h, grad_output, floats_mut(&mut dh), width);
                 if now.start > 0 {
-                    let _ = narrow(&dh, &(0..now.len())).addmm_(&narrow(&self.s, now), u);
+                    let _ = dh.addmm_(&s, u);
                 }
             }
             let (da, ds) = (&self.a, &self.s);
@@ -140,13 +131,6 @@ fn steps(packing: &Packing) -> impl Iterator<Item = Range<usize>> {
         *start += alive as usize;
         Some(first..*start)
     })
-}
-
-/// The state before each packed row.
-fn previous_states(initial: &Tensor, output: &Tensor, packing: &Packing) -> Tensor {
-    let later = steps(packing).zip(steps(packing).skip(1));
-    let later = later.map(|(before, now)| narrow(output, &(before.start..before.start + now.len())));
-    Tensor::cat(&std::iter::once(initial.shallow_clone()).chain(later).collect::<Vec<_>>(), 0)
 }
 
 fn narrow(tensor: &Tensor, rows: &Range<usize>) -> Tensor {
@@ -224,5 +208,40 @@ fn backward_rows(a: &mut [f32], s: &mut [f32], h: &[f32], grad_output: &[f32], d
             }
         }
         a[..2 * hidden].copy_from_slice(&s[..2 * hidden]);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::{backward, backward_rows, forward, forward_rows};
+
+    fn numbers(n: usize, seed: usize) -> Vec<f32> {
+        (0..n).map(|i| ((i * 7919 + seed * 104_729) % 10_007) as f32 / 1_000.0 - 5.0).collect()
+    }
+
+    /// The machine's widest vectors, no vectors but those of every machine, and one number at a time.
+    #[test]
+    fn every_instruction_set_gives_the_same_bits() {
+        const ROWS: usize = 3;
+        for hidden in [1, 3, 8, 16, 19, 64, 255, 256] {
+            let (a, s, c) = (numbers(ROWS * 3 * hidden, 0), numbers(ROWS * 3 * hidden, 1), numbers(3 * hidden, 2));
+            let (h, grad) = (numbers(ROWS * hidden, 3), numbers(ROWS * hidden, 4));
+            let run = |wide: bool| {
+                let (mut a, mut s, mut next, mut dh) = (a.clone(), s.clone(), h.clone(), h.clone());
+                (if wide { forward } else { forward_rows })(&mut a, &mut s, &c, &h, &mut next);
+                let gates = a.clone();
+                (if wide { backward } else { backward_rows })(&mut a, &mut s, &h, &grad, &mut dh, hidden);
+                [gates, a, s, next, dh].map(|x| x.iter().map(|x| x.to_bits()).collect::<Vec<_>>())
+            };
+            assert_eq!(run(true), run(false), "hidden {hidden}");
+            // A unit alone is the scalar tail of a loop.
+            let (row, unit) = (ROWS - 1, hidden - 1);
+            let at = |x: &[f32], gate: usize| x[(row * 3 + gate) * hidden + unit];
+            let (mut a, mut s) = ([0, 1, 2].map(|gate| at(&a, gate)), [0, 1, 2].map(|gate| at(&s, gate)));
+            let c = [0, 1, 2].map(|gate| c[gate * hidden + unit]);
+            let mut next = [0.0];
+            forward(&mut a, &mut s, &c, &[h[row * hidden + unit]], &mut next);
+            assert_eq!(next[0].to_bits(), run(true)[3][row * hidden + unit], "hidden {hidden}");
+        }
     }
 }

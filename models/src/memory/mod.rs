@@ -41,6 +41,7 @@ impl State {
     }
 
     /// The state with just these rows, in this order.
+    #[must_use]
     pub fn select(&self, rows: &[i64]) -> State {
         State(
             self.0
@@ -80,7 +81,8 @@ pub trait Memory: Send {
     /// The state before the first step, all zeros, for `rows` sequences.
     fn initial_state(&self, rows: i64, device: Device) -> State;
 
-    /// One time step: `input [rows, input width]` to `output [rows, output width]` and the next state.
+    /// One time step: `input [rows, input width]` to `output [rows, output width]` and the next state. For acting: no
+    /// gradients are promised.
     fn step(&self, input: &Tensor, state: &State) -> (Tensor, State);
 
     /// Whole sequences: packed `input [rows, input width]`; `state` before their first step, in packed order.
@@ -196,7 +198,8 @@ impl Registry {
 }
 
 fn parse<M: MemoryKind>(options: &toml::Table) -> Result<M::Options, String> {
-    options.clone().try_into().map_err(|error: toml::de::Error| error.message().trim().to_owned())
+    // Its message alone does not say which key a wrong type stands at.
+    options.clone().try_into().map_err(|error: toml::de::Error| error.to_string().trim().replace('\n', " "))
 }
 
 /// Adds to the parameters' gradients as autograd would: for a memory with a backward of its own.

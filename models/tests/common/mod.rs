@@ -1,5 +1,5 @@
 //! What the tests of memories and policies share.
-#![allow(dead_code)]
+#![allow(dead_code, unreachable_pub)]
 
 use std::collections::BTreeMap;
 

@@ -1,0 +1,151 @@
+//! A temporary directory with a tiny configuration, and the runs in it.
+
+use std::fs;
+use std::path::PathBuf;
+
+use serde_json::Value;
+use tempfile::TempDir;
+
+use crate::process::{Outcome, Process, Program};
+
+/// A configuration whose epochs take some hundredths of a second: 8 of them.
+const TINY: &str = "
+steps = 4096
+threads = 1
+checkpoint_epochs = 2
+device = \"cpu\"
+[service]
+actors = 1
+slots = 16
+[memory]
+hidden_size = 16
+[ppo]
+batch_steps = 512
+minibatch_steps = 256
+passes = 1
+";
+
+/// Where the programs of a test run: a directory of their own, removed at the end.
+#[derive(Debug)]
+pub struct Scene {
+    dir: TempDir,
+}
+
+impl Default for Scene {
+    fn default() -> Self {
+        Self::new()
+    }
+}
+
+impl Scene {
+    /// A new directory with `tiny.toml`.
+    ///
+    /// # Panics
+    /// If it cannot be made.
+    pub fn new() -> Self {
+        let scene = Self { dir: tempfile::tempdir().expect("a temporary directory") };
+        scene.write("tiny.toml", TINY);
+        scene
+    }
+
+    /// The path of `name` in it.
+    pub fn path(&self, name: &str) -> PathBuf {
+        self.dir.path().join(name)
+    }
+
+    /// Writes a file.
+    ///
+    /// # Panics
+    /// If it cannot be written.
+    pub fn write(&self, name: &str, text: &str) {
+        fs::write(self.path(name), text).expect("a file in the scene");
+    }
+
+    /// Reads a file.
+    ///
+    /// # Panics
+    /// If it cannot be read.
+    #[track_caller]
+    pub fn read(&self, name: &str) -> String {
+        fs::read_to_string(self.path(name)).unwrap_or_else(|error| panic!("{name}: {error}"))
+    }
+
+    /// Reads a JSON file.
+    ///
+    /// # Panics
+    /// If it cannot be read, or is not JSON.
+    #[track_caller]
+    pub fn json(&self, name: &str) -> Value {
+        serde_json::from_str(&self.read(name)).unwrap_or_else(|error| panic!("{name}: {error}"))
+    }
+
+    /// Starts a program in this directory.
+    pub fn start(&self, program: Program, args: &[&str]) -> Process {
+        let mut command = program.command();
+        command.args(args).current_dir(self.dir.path());
+        Process::start(&format!("{} {}", program.name(), args.join(" ")), command)
+    }
+
+    /// Runs `learner` to its end.
+    #[track_caller]
+    pub fn learner(&self, args: &[&str]) -> Outcome {
+        self.start(Program::Learner, args).wait()
+    }
+
+    /// Starts `learner train` with the tiny configuration and these flags, into the directory `run`.
+    pub fn train(&self, run: &str, flags: &[&str]) -> Process {
+        self.start(Program::Learner, &[&["train", "--config", "tiny.toml", "--out", run], flags].concat())
+    }
+
+    /// Starts `learner resume` of the directory `run`.
+    pub fn resume(&self, run: &str, flags: &[&str]) -> Process {
+        self.start(Program::Learner, &[&["resume", run], flags].concat())
+    }
+
+    /// Starts an actor for the learner at `url`.
+    pub fn actor(&self, url: &str, flags: &[&str]) -> Process {
+        self.start(Program::Actor, &[&["--learner", url, "--slots", "16"], flags].concat())
+    }
+
+    /// Trains to the end and returns `metrics.csv`.
+    ///
+    /// # Panics
+    /// If that does not succeed.
+    #[track_caller]
+    pub fn curve(&self, run: &str, flags: &[&str]) -> String {
+        self.train(run, flags).expect(0);
+        self.metrics(run)
+    }
+
+    /// `metrics.csv` of a run.
+    ///
+    /// # Panics
+    /// If there is none.
+    #[track_caller]
+    pub fn metrics(&self, run: &str) -> String {
+        self.read(&format!("{run}/metrics.csv"))
+    }
+
+    /// Rows of a run's `metrics.csv` so far.
+    pub fn rows(&self, run: &str) -> usize {
+        let text = fs::read_to_string(self.path(run).join("metrics.csv")).unwrap_or_default();
+        text.matches('\n').count().saturating_sub(1)
+    }
+
+    /// The names of a run's checkpoints, oldest first.
+    pub fn checkpoints(&self, run: &str) -> Vec<String> {
+        let entries = fs::read_dir(self.path(run).join("checkpoints")).into_iter().flatten().flatten();
+        let mut names: Vec<String> = entries.map(|entry| entry.file_name().to_string_lossy().into_owned()).collect();
+        names.sort();
+        names
+    }
+
+    /// Waits until a run that goes on has as many rows.
+    ///
+    /// # Panics
+    /// If it ends before that, or past the deadline.
+    #[track_caller]
+    pub fn reached(&self, learner: &mut Process, run: &str, rows: usize) {
+        learner.until(&format!("{rows} epochs of {run}"), |_| (self.rows(run) >= rows).then_some(()));
+    }
+}
