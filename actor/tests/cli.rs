@@ -19,7 +19,8 @@ fn help_and_version_succeed() {
 
 #[test]
 fn wrong_usage_exits_with_2() {
-    for args in [&[][..], &["--learner", "https://box:1"], &["--learner", "box:1", "--slots", "0"], &["--lerner", "x"]] {
+    for args in [&[][..], &["--learner", "https://box:1"], &["--learner", "box:1", "--slots", "0"], &["--lerner", "x"]]
+    {
         let output = actor(args);
         assert_eq!(output.status.code(), Some(2), "{args:?}");
         assert!(output.stdout.is_empty() && !output.stderr.is_empty(), "{args:?}");

@@ -134,7 +134,7 @@ mod tests {
         for _ in 0..updates {
             adam.zero_grad();
             (x - target).square().sum(Kind::Float).backward();
-            adam.step(0.1);
+            let _norm = adam.step(0.1);
         }
     }
 

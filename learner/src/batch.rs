@@ -234,3 +234,100 @@ fn chunks_by_steps(lengths: &[i64], budget: i64) -> Vec<std::ops::Range<usize>> 
     }
     chunks
 }
+
+#[cfg(test)]
+mod tests {
+    use bytes::Bytes;
+    use popgym_envs::space::{Space, Value};
+    use popgym_models::{Policy, PolicyOptions, PolicySpec, memory};
+    use popgym_proto::{Columns, Episode};
+    use tch::{Device, Kind, Tensor};
+
+    use super::{Batch, chunks_by_steps, to_vec};
+    use crate::config::Ppo;
+
+    fn policy() -> Policy {
+        let spec = PolicySpec {
+            observation: Space::Discrete(3),
+            action: Space::Discrete(2),
+            memory: "gru".to_owned(),
+            memory_options: toml::Table::from_iter([("hidden_size".to_owned(), toml::Value::Integer(8))]),
+            options: PolicyOptions { log_std_min: f64::NEG_INFINITY, log_std_max: f64::INFINITY },
+        };
+        tch::manual_seed(3);
+        Policy::new(&spec, &memory::Registry::standard(), Device::Cpu).unwrap()
+    }
+
+    fn episode(index: u64, observations: &[u8], actions: &[u8], terminated: bool) -> Episode {
+        let columns = |classes: &[u8]| Columns { discrete: Bytes::copy_from_slice(classes), real: Vec::new() };
+        Episode {
+            index,
+            steps: actions.len(),
+            observations: columns(observations),
+            actions: columns(actions),
+            rewards: (0..actions.len()).map(|t| (t + 1) as f64).collect(),
+            log_probs: vec![-0.5; actions.len()],
+            terminated,
+            truncated: !terminated,
+        }
+    }
+
+    /// Log-probabilities and values of one episode, played step by step: what the packed pass must find.
+    fn step_by_step(policy: &Policy, episode: &Episode) -> (Vec<f64>, Vec<f64>) {
+        let (mut log_probs, mut values) = (Vec::new(), Vec::new());
+        let mut state = policy.initial_state(1);
+        let mut features = vec![0.0; policy.encoder().width()];
+        for (t, observation) in episode.observations.discrete.iter().enumerate() {
+            let previous = [if t == 0 { 0 } else { episode.actions.discrete[t - 1] }];
+            let value = |discrete| Value { discrete, real: &[] };
+            policy.encoder().encode(value(&[*observation]), value(&previous), t == 0, &mut features);
+            let (params, critic, next) = policy.step(&Tensor::from_slice(&features).unsqueeze(0), &state);
+            values.push(critic.double_value(&[0]));
+            if t < episode.steps {
+                let action = i64::from(episode.actions.discrete[t]);
+                log_probs.push(params.log_softmax(-1, Kind::Float).double_value(&[0, action]));
+            }
+            state = next;
+        }
+        (log_probs, values)
+    }
+
+    #[test]
+    fn the_packed_pass_finds_what_single_steps_find() {
+        let policy = policy();
+        let episodes = [
+            episode(0, &[0, 1, 2], &[1, 0], true),
+            episode(1, &[2, 2, 1, 0, 1], &[0, 1, 1, 0], false),
+            episode(2, &[1, 0], &[1], false),
+        ];
+        let ppo =
+            Ppo { minibatch_steps: 5, gae_lambda: 1.0, gamma: 0.5, bootstrap_at_truncation: true, ..Ppo::paper() };
+        let batch = Batch::new(&episodes, &Space::Discrete(2), &policy);
+        let old = batch.evaluate(&policy, &ppo);
+        let (log_probs, targets) = (to_vec(&old.log_probs), to_vec(&old.targets));
+        for (episode, &start) in episodes.iter().zip(&batch.starts) {
+            let (expected, values) = step_by_step(&policy, episode);
+            // With lambda 1 the target is the discounted return, with V(o_T) behind a mere truncation.
+            let mut discounted = if episode.terminated { 0.0 } else { values[episode.steps] };
+            for t in (0..episode.steps).rev() {
+                discounted = episode.rewards[t] + 0.5 * discounted;
+                let row = start as usize + t;
+                assert!((f64::from(log_probs[row]) - expected[t]).abs() < 1e-5);
+                assert!((f64::from(targets[row]) - discounted).abs() < 1e-5, "{} {discounted}", targets[row]);
+            }
+        }
+        let advantages = to_vec(&old.advantages);
+        assert!(advantages.iter().sum::<f32>().abs() < 1e-5);
+        assert!((advantages.iter().map(|x| x * x).sum::<f32>() - batch.steps() as f32).abs() < 1e-4);
+        let differences =
+            (0..3).flat_map(|e| step_by_step(&policy, &episodes[e]).0).map(|log_prob| (log_prob + 0.5).abs());
+        assert!((old.log_prob_difference - differences.fold(0.0, f64::max)).abs() < 1e-5);
+    }
+
+    #[test]
+    fn chunks_hold_every_episode_once() {
+        assert_eq!(chunks_by_steps(&[3, 3, 3, 1], 5), [0..2, 2..4]);
+        assert_eq!(chunks_by_steps(&[9], 5), vec![0..1]);
+        assert_eq!(chunks_by_steps(&[1, 1], 5), vec![0..2]);
+    }
+}

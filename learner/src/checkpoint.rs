@@ -239,5 +239,5 @@ fn remove_dir_if_there(path: &Path) -> anyhow::Result<()> {
 }
 
 fn hex_digest(bytes: &[u8]) -> String {
-    Sha256::digest(bytes).iter().map(|byte| format!("{byte:02x}")).collect()
+    format!("{:x}", Sha256::digest(bytes))
 }

@@ -46,7 +46,7 @@ ppo_keys! {
     /// Passes over an epoch's batch
     passes: u32 = 30, |_: &Quick| 3;
     /// Discount of a step
-    gamma: f64 = 0.99, |_: &Quick| 0.95;
+    gamma: f64 = 0.99, |quick: &Quick| 1.0 - 1.0 / quick.horizon;
     /// Lambda of generalised advantage estimation
     gae_lambda: f64 = 1.0, |_: &Quick| 0.95;
     /// The surrogate's ratio is clipped to 1 - clip .. 1 + clip
@@ -94,6 +94,8 @@ pub enum LearningRateSchedule {
 /// What `quick` derives from an environment.
 struct Quick {
     batch_steps: i64,
+    /// The discount's, in steps.
+    horizon: f64,
     reward_scale: f64,
 }
 
@@ -103,12 +105,13 @@ impl Quick {
         // 64 of the longest episodes, but never so few steps that an update is noise, nor more than a second or two of
         // sampling.
         let batch_steps = (64 * longest).clamp(8_192, (16 * longest).max(16_384));
-        // Returns are within about +-1, earned over the whole episode: this makes what is earned within the discount's
-        // horizon of about 20 steps, which is what the critic predicts, of order 1 too.
+        // A tenth of the episode: the longer the game, the farther its consequences.
+        let horizon = (longest as f64 / 10.0).clamp(10.0, 100.0);
+        // Returns are within about +-1 and earned over the whole episode: this makes what is earned within the horizon, which
+        // is what the critic predicts, of order 1 too.
         let (low, high) = env.return_range;
-        let horizon = 20.0f64.min(longest as f64);
         let reward_scale = 2.0 * longest as f64 / (horizon * (high - low));
-        Self { batch_steps, reward_scale }
+        Self { batch_steps, horizon, reward_scale }
     }
 }
 

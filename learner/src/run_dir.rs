@@ -75,7 +75,7 @@ impl RunDir {
         let env = config.env.trim_start_matches("popgym-").trim_end_matches("-v0");
         let stem = format!("{env}-{}-{}-seed{}", config.memory_name(), config.preset, config.seed);
         let path = |number: u32| Path::new("runs").join(format!("{stem}-{number:03}"));
-        path((1..).find(|&number| !path(number).exists()).unwrap_or(0))
+        path((1..u32::MAX).find(|&number| !path(number).exists()).unwrap_or(u32::MAX))
     }
 
     /// The directory.
@@ -98,7 +98,7 @@ impl RunDir {
 fn fresh_run_id(path: &Path) -> String {
     let now = std::time::SystemTime::now().duration_since(std::time::UNIX_EPOCH).unwrap_or_default();
     let text = format!("{} {} {}", now.as_nanos(), std::process::id(), path.display());
-    Sha256::digest(text).iter().take(8).map(|byte| format!("{byte:02x}")).collect()
+    format!("{:x}", Sha256::digest(text))[..16].to_owned()
 }
 
 fn lock(path: &Path) -> anyhow::Result<File> {

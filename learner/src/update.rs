@@ -9,6 +9,7 @@
 //! ```
 
 use popgym_envs::EpisodeRng;
+use popgym_models::distribution::Evaluation;
 use popgym_models::{Packing, Policy};
 use tch::{Device, Kind, Tensor};
 
@@ -77,21 +78,14 @@ pub fn update(
                 &minibatch.actions.1,
             );
 
-            let ratio = (scores.log_prob - &minibatch.old_log_probs).exp();
-            let advantages = &minibatch.advantages;
-            let clipped = ratio.clamp(1.0 - ppo.clip, 1.0 + ppo.clip) * advantages;
-            let policy_loss = -(ratio * advantages).minimum(&clipped).mean(Kind::Float);
-            let squared_error = (&outputs.values - &minibatch.targets).square();
-            let value_loss = squared_error.clamp_max(ppo.value_clip).mean(Kind::Float);
-            let entropy = scores.entropy.mean(Kind::Float);
-            let kl = scores.kl.mean(Kind::Float);
-            let loss =
-                &policy_loss + &value_loss * ppo.value_coef - &entropy * ppo.entropy_coef + &kl * schedule.kl_coef;
+            let losses = minibatch.losses(&scores, &outputs.values, ppo);
+            let loss = &losses.policy + &losses.value * ppo.value_coef - &losses.entropy * ppo.entropy_coef
+                + &losses.kl * schedule.kl_coef;
 
             adam.zero_grad();
             outputs.backward(&loss);
             let grad_norm = adam.step(schedule.learning_rate);
-            let means = [&policy_loss, &value_loss, &kl, &entropy, &grad_norm];
+            let means = [&losses.policy, &losses.value, &losses.kl, &losses.entropy, &grad_norm];
             totals.add(&means, minibatch.packing.rows(), computed_steps);
         }
     }
@@ -168,6 +162,27 @@ impl Minibatch {
             packing,
         }
     }
+
+    fn losses(&self, scores: &Evaluation, values: &Tensor, ppo: &Ppo) -> Losses {
+        let ratio = (&scores.log_prob - &self.old_log_probs).exp();
+        let clipped = ratio.clamp(1.0 - ppo.clip, 1.0 + ppo.clip) * &self.advantages;
+        let surrogate = (ratio * &self.advantages).minimum(&clipped);
+        let squared_error = (values - &self.targets).square();
+        Losses {
+            policy: -surrogate.mean(Kind::Float),
+            value: squared_error.clamp_max(ppo.value_clip).mean(Kind::Float),
+            entropy: scores.entropy.mean(Kind::Float),
+            kl: scores.kl.mean(Kind::Float),
+        }
+    }
+}
+
+/// The terms of the loss, each a mean over the minibatch's steps.
+struct Losses {
+    policy: Tensor,
+    value: Tensor,
+    entropy: Tensor,
+    kl: Tensor,
 }
 
 /// Sums of the reported quantities, kept on the device so that no minibatch waits for it.
@@ -209,9 +224,41 @@ impl Totals {
 #[cfg(test)]
 mod tests {
     use popgym_envs::{Purpose, stream};
+    use popgym_models::Packing;
+    use popgym_models::distribution::Evaluation;
     use proptest::prelude::*;
+    use tch::Tensor;
 
-    use super::{minibatches, next_kl_coef};
+    use super::{Minibatch, minibatches, next_kl_coef};
+    use crate::config::Ppo;
+
+    /// Reference 3.5, by hand: clip 0.3, squared error clamped at 10. The three steps are: ratio 2 clipped to 1.3 with a
+    /// gain; ratio 2 not clipped with a loss; ratio 0.5 clipped to 0.7 with a loss.
+    #[test]
+    fn losses_by_hand() {
+        let column = |values: &[f32]| Tensor::from_slice(values);
+        let minibatch = Minibatch {
+            packing: Packing::new(&[3]),
+            features: Tensor::new(),
+            actions: (Tensor::new(), Tensor::new()),
+            old_params: Tensor::new(),
+            old_log_probs: column(&[-1.0, -1.0, -1.0]),
+            advantages: column(&[1.0, -1.0, -2.0]),
+            targets: column(&[0.0, 1.0, 5.0]),
+        };
+        let ln2 = std::f32::consts::LN_2;
+        let scores = Evaluation {
+            log_prob: column(&[-1.0 + ln2, -1.0 + ln2, -1.0 - ln2]),
+            entropy: column(&[0.25, 0.5, 0.75]),
+            kl: column(&[0.0, 0.3, 0.6]),
+        };
+        let losses = minibatch.losses(&scores, &column(&[0.5, 3.0, 1.0]), &Ppo::paper());
+        let near = |found: &Tensor, expected: f64| (found.double_value(&[]) - expected).abs() < 1e-6;
+        assert!(near(&losses.policy, -(1.3 - 2.0 - 1.4) / 3.0));
+        assert!(near(&losses.value, (0.25 + 4.0 + 10.0) / 3.0));
+        assert!(near(&losses.entropy, 0.5));
+        assert!(near(&losses.kl, 0.3));
+    }
 
     #[test]
     fn kl_coefficient_follows_the_reference() {

@@ -20,7 +20,7 @@ pub use process::{Outcome, Process, Program};
 pub use scene::Scene;
 
 /// A test that waits longer than this for anything has failed.
-pub const DEADLINE: Duration = Duration::from_secs(120);
+pub const DEADLINE: Duration = Duration::from_mins(2);
 
 /// How often a wait looks again.
 pub const POLL_INTERVAL: Duration = Duration::from_millis(2);

@@ -75,18 +75,6 @@ pub struct Outcome {
     pub stderr: String,
 }
 
-impl Outcome {
-    /// The same, if the exit code is this one.
-    ///
-    /// # Panics
-    /// With all that the process wrote, if it is not.
-    #[track_caller]
-    pub fn expect(self, code: i32) -> Self {
-        assert_eq!(self.status.code(), Some(code), "{}, expected {code}\n{}{}", self.status, self.stdout, self.stderr);
-        self
-    }
-}
-
 /// A process that was started, and dies with this value.
 #[derive(Debug)]
 pub struct Process {
@@ -183,7 +171,7 @@ impl Process {
         let what = format!("the end of {}", self.name);
         let status = until(&what, || self.child.try_wait().expect("a child can be waited for"));
         let (stdout, stderr) = (self.stdout(), self.stderr());
-        assert!(!stderr.contains("panicked at"), "{} has panicked", self.name);
+        assert!(!stderr.contains("panicked at"), "{} has panicked, {status}", self.name);
         Outcome { status, stdout, stderr }
     }
 
@@ -303,7 +291,9 @@ impl Life {
     #[track_caller]
     pub fn expect_gone(lives: &[Self]) {
         let mut what = "the end of".to_owned();
-        lives.iter().for_each(|life| write!(what, " {}", life.id).expect("memory"));
+        for life in lives {
+            write!(what, " {}", life.id).expect("memory");
+        }
         until(&what, || lives.iter().all(|life| !life.is_running()).then_some(()));
     }
 }

@@ -6,7 +6,7 @@ use std::path::PathBuf;
 use serde_json::Value;
 use tempfile::TempDir;
 
-use crate::process::{Outcome, Process, Program};
+use crate::process::{Process, Program};
 
 /// A configuration whose epochs take some hundredths of a second: 8 of them.
 const TINY: &str = "
@@ -86,20 +86,19 @@ impl Scene {
         Process::start(&format!("{} {}", program.name(), args.join(" ")), command)
     }
 
-    /// Runs `learner` to its end.
-    #[track_caller]
-    pub fn learner(&self, args: &[&str]) -> Outcome {
-        self.start(Program::Learner, args).wait()
+    /// Starts `learner`.
+    pub fn learner(&self, args: &[&str]) -> Process {
+        self.start(Program::Learner, args)
     }
 
     /// Starts `learner train` with the tiny configuration and these flags, into the directory `run`.
     pub fn train(&self, run: &str, flags: &[&str]) -> Process {
-        self.start(Program::Learner, &[&["train", "--config", "tiny.toml", "--out", run], flags].concat())
+        self.learner(&[&["train", "--config", "tiny.toml", "--out", run], flags].concat())
     }
 
     /// Starts `learner resume` of the directory `run`.
     pub fn resume(&self, run: &str, flags: &[&str]) -> Process {
-        self.start(Program::Learner, &[&["resume", run], flags].concat())
+        self.learner(&[&["resume", run], flags].concat())
     }
 
     /// Starts an actor for the learner at `url`.

@@ -12,9 +12,17 @@ fn one_curve(lag: &str) -> String {
     curves[0].clone()
 }
 
-/// A curve with as many slots as given, which changes how episodes are spread over time, and nothing else.
+/// The curve of a run with these flags.
 fn curve(flags: &[&str]) -> String {
     Scene::new().curve("run", flags)
+}
+
+/// Whoever samples, and however many episodes at a time: one curve.
+fn assert_one_curve(flags: &[&str]) {
+    let few = curve(&[flags, &["--actors", "1", "--slots", "3"]].concat());
+    let many = curve(&[flags, &["--actors", "3", "--slots", "40"]].concat());
+    assert!(few.lines().count() > 2, "{flags:?}: {few}");
+    assert_eq!(few, many, "{flags:?}");
 }
 
 #[test]
@@ -40,4 +48,23 @@ fn a_memory_without_a_state_is_no_exception() {
     let curve = |run: &str, flags: &[&str]| scene.curve(run, &[&["--memory", "mlp"], flags].concat());
     assert_eq!(curve("a", &[]), curve("b", &["--actors", "2"]));
     assert_ne!(scene.metrics("a"), curve("c", &["--lag", "1"]));
+}
+
+#[test]
+fn every_kind_of_space_and_episodes_of_every_length() {
+    // Episodes that end early make the batch's prefix depend on every one before it.
+    assert_one_curve(&["--env", "PositionOnlyCartPoleEasy", "--learning-rate", "0.01"]);
+    assert_one_curve(&["--env", "PositionOnlyPendulumEasy", "--lag", "1", "--steps", "2048"]);
+    assert_one_curve(&["--env", "BattleshipEasy", "--steps", "2048"]);
+}
+
+#[test]
+fn a_memory_of_the_usual_size_on_two_threads() {
+    let flags = ["--preset", "quick", "--threads", "2", "--seed", "3", "--batch-steps", "1024"];
+    let curves = [("1", "5"), ("2", "128")].map(|(actors, slots)| {
+        let scene = Scene::new();
+        scene.write("tiny.toml", &scene.read("tiny.toml").replace("hidden_size = 16", "hidden_size = 256"));
+        scene.curve("run", &[&flags[..], &["--actors", actors, "--slots", slots]].concat())
+    });
+    assert_eq!(curves[0], curves[1]);
 }

@@ -19,7 +19,7 @@ pub fn list(args: &ListArgs, extensions: &Extensions) -> Outcome {
     }
     match args.what {
         Listed::Envs => {
-            for entry in extensions.envs.iter() {
+            for entry in &extensions.envs {
                 println!("{:<28} {:<11} {}", entry.name, entry.group, entry.id());
             }
         }

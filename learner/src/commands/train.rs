@@ -64,7 +64,7 @@ fn configure(args: &TrainArgs, extensions: &Extensions) -> anyhow::Result<Config
 /// Replaces `auto` by the device it means here.
 fn resolve_device(config: &mut Config) -> anyhow::Result<()> {
     let device = popgym_models::device::parse(&config.device)?;
-    config.device = if device == Device::Cpu { "cpu" } else { "cuda" }.to_owned();
+    if device == Device::Cpu { "cpu" } else { "cuda" }.clone_into(&mut config.device);
     Ok(())
 }
 
