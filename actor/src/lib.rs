@@ -22,7 +22,7 @@ use std::process::ExitCode;
 use std::time::{Duration, Instant};
 
 use clap::Parser as _;
-use tracing::{error, info};
+use tracing::info;
 use tracing_subscriber::EnvFilter;
 
 pub mod args;
@@ -71,7 +71,7 @@ pub fn run(
     match start(envs, memories, &args) {
         Ok(()) => ExitCode::SUCCESS,
         Err(reason) => {
-            error!("{reason:#}");
+            eprintln!("error: {reason:#}");
             ExitCode::FAILURE
         }
     }

@@ -1,7 +1,9 @@
 //! The command line.
 
 use std::path::PathBuf;
+use std::process::ExitCode;
 
+use clap::error::ErrorKind;
 use clap::{Parser, Subcommand, ValueEnum};
 use serde::Serialize;
 use toml::{Table, Value};
@@ -79,7 +81,7 @@ pub struct RunFlags {
     #[serde(skip_serializing_if = "Option::is_none")]
     pub stop_at_mmer: Option<f64>,
     /// Seed of everything random in the run [default: 0]
-    #[arg(long, value_name = "S")]
+    #[arg(long, value_name = "S", allow_negative_numbers = true, value_parser = seed())]
     #[serde(skip_serializing_if = "Option::is_none")]
     pub seed: Option<u64>,
     /// 0: sample with the newest weights; 1: with those before, while the learner learns [default: 0]
@@ -90,7 +92,7 @@ pub struct RunFlags {
     #[arg(long, value_name = "D")]
     #[serde(skip_serializing_if = "Option::is_none")]
     pub device: Option<String>,
-    /// Threads of the learner's libtorch; results depend on it [default: one a core, 8 at most]
+    /// Threads of the learner's libtorch; results depend on it: give it where machines differ [default: one a core, 8 at most]
     #[arg(long, value_name = "N")]
     #[serde(skip_serializing_if = "Option::is_none")]
     pub threads: Option<u32>,
@@ -173,7 +175,7 @@ pub struct EvalArgs {
     #[arg(long, value_name = "N", default_value_t = 100)]
     pub episodes: u64,
     /// Seed of the episodes; they are never those of training
-    #[arg(long, value_name = "S", default_value_t = 0)]
+    #[arg(long, value_name = "S", default_value_t = 0, allow_negative_numbers = true, value_parser = seed())]
     pub seed: u64,
     /// Which weights: of the checkpoint with the best mean return, or the last
     #[arg(long, value_enum, default_value_t = Which::Best)]
@@ -246,6 +248,25 @@ impl ResumeArgs {
         insert(&mut table, "service", Table::try_from(&self.service)?);
         Ok(table)
     }
+}
+
+/// Prints what clap says: help and version as they are, an error and its tip in one line.
+pub(crate) fn usage(error: &clap::Error) -> ExitCode {
+    if !error.use_stderr() || error.kind() == ErrorKind::DisplayHelpOnMissingArgumentOrSubcommand {
+        // Nothing better to do if nobody reads it.
+        let _ = error.print();
+        return ExitCode::from(if error.use_stderr() { 2 } else { 0 });
+    }
+    let text = error.to_string();
+    let telling = text.lines().map(str::trim).take_while(|line| !line.starts_with("Usage:"));
+    let lines: Vec<&str> = telling.filter(|line| !line.is_empty() && !line.starts_with("For more")).collect();
+    eprintln!("{}", lines.join("; "));
+    ExitCode::from(2)
+}
+
+/// TOML's integers end at 2^63 - 1.
+fn seed() -> clap::builder::RangedU64ValueParser<u64> {
+    clap::value_parser!(u64).range(0..=i64::MAX as u64)
 }
 
 fn insert(table: &mut Table, key: &str, part: Table) {

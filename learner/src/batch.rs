@@ -102,8 +102,9 @@ impl Batch {
         tch::no_grad(|| {
             for episodes in chunks_by_steps(&self.lengths, ppo.minibatch_steps) {
                 let lengths: Vec<i64> = self.lengths[episodes.clone()].iter().map(|length| length + 1).collect();
-                let index = Packing::new(&lengths).gather_index(&self.starts[episodes], device);
-                let outputs = behaviour.scan(&self.features(behaviour.encoder(), &index), &Packing::new(&lengths), 0);
+                let packing = Packing::new(&lengths);
+                let index = packing.gather_index(&self.starts[episodes], device);
+                let outputs = behaviour.scan(&self.features(behaviour.encoder(), &index), &packing, 0);
                 let (discrete, real) = self.actions(&index);
                 let scores = behaviour.distribution().evaluate(&outputs.params, &outputs.params, &discrete, &real);
                 let _ = log_probs.index_copy_(0, &index, &scores.log_prob);

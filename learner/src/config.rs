@@ -3,15 +3,18 @@
 //! All three are TOML tables of the same keys. The preset's table is complete, so a key that it lacks is unknown; the
 //! file's table goes over it, and the flags' over both.
 
+use std::net::SocketAddr;
 use std::path::Path;
 
 use anyhow::{Context, bail};
 use popgym_envs::EnvSpec;
-use popgym_models::{PolicyOptions, PolicySpec, memory};
+use popgym_models::{Policy, PolicyOptions, PolicySpec, memory};
 use popgym_proto::RunSpec;
 use serde::{Deserialize, Serialize};
+use tch::Device;
 use toml::{Table, Value};
 
+use crate::checkpoint::Progress;
 pub use crate::ppo_keys::{LearningRateSchedule, Ppo, PpoFlags};
 
 /// The presets' names, with what each is for.
@@ -67,11 +70,14 @@ pub struct ServiceConfig {
     pub actors: u32,
     /// Episodes that a local actor steps at a time.
     pub slots: u32,
-    /// Address for actors.
+    /// Address for actors; empty: any free port of this machine for local actors, port 50051 of this machine for others.
     pub listen: String,
     /// Address for Prometheus; empty: none.
     pub metrics_listen: String,
 }
+
+/// More local actors than this are a slip of the pen.
+const MAX_LOCAL_ACTORS: u64 = 256;
 
 /// Keys of the `[service]` table: what may change when a run is resumed.
 const SERVICE: &str = "service";
@@ -89,17 +95,18 @@ impl Config {
     ) -> anyhow::Result<Self> {
         let mut given = file.clone();
         merge(&mut given, flags);
-        let preset = text(&given, "preset")?.unwrap_or("quick");
-        let env = text(&given, "env")?.unwrap_or("popgym-RepeatPreviousEasy-v0");
+        let preset = text(&given, "preset", "")?.unwrap_or("quick");
+        let env = text(&given, "env", "")?.unwrap_or("popgym-RepeatPreviousEasy-v0");
         let entry = envs.get(env)?;
         let mut table = preset_table(preset, &entry.spec)?;
         check_keys(&given, &table, "")?;
         merge(&mut table, &given);
         table.insert("env".to_owned(), Value::String(entry.spec.id.clone()));
         resolve_memory(&mut table, memories)?;
-        resolve_listen(&mut table);
         let config: Self = table.try_into().map_err(|error: toml::de::Error| anyhow::anyhow!(one_line(&error)))?;
         config.validate()?;
+        // Builds and drops a policy: memory and spaces check their own options.
+        Policy::new(&config.policy_spec(&entry.spec), memories, Device::Cpu)?;
         Ok(config)
     }
 
@@ -132,6 +139,16 @@ impl Config {
             table.remove(SERVICE);
         }
         difference(&tables[0], &tables[1], "")
+    }
+
+    /// Why a run that stands at `progress` is complete, if it is.
+    pub fn reached(&self, progress: &Progress) -> Option<&'static str> {
+        let target = self.stop_at_mmer.unwrap_or(f64::INFINITY);
+        if progress.mmer.is_some_and(|mmer| mmer >= target) {
+            Some("mmer")
+        } else {
+            (progress.env_steps >= self.steps).then_some("steps")
+        }
     }
 
     /// Name of the memory.
@@ -176,7 +193,11 @@ impl Config {
         })
     }
 
-    fn validate(&self) -> anyhow::Result<()> {
+    /// Checks every value that stands alone.
+    ///
+    /// # Errors
+    /// The first key that is impossible, its value, and what is allowed.
+    pub fn validate(&self) -> anyhow::Result<()> {
         let range = |key: &str, value: u64, least: u64, most: u64| {
             if (least..=most).contains(&value) {
                 Ok(())
@@ -198,8 +219,16 @@ impl Config {
         range("rows", u64::from(self.rows), 16, u64::from(popgym_proto::limits::MAX_SLOTS))?;
         range("checkpoint_epochs", self.checkpoint_epochs, 1, 1 << 30)?;
         range("keep_checkpoints", u64::from(self.keep_checkpoints), 1, 1000)?;
-        range("service.actors", u64::from(self.service.actors), 0, 1024)?;
+        range("service.actors", u64::from(self.service.actors), 0, MAX_LOCAL_ACTORS)?;
         range("service.slots", u64::from(self.service.slots), 1, u64::from(popgym_proto::limits::MAX_SLOTS))?;
+        let ServiceConfig { listen, metrics_listen, .. } = &self.service;
+        let is_address = |(host, port): (&str, &str)| !host.is_empty() && port.parse::<u16>().is_ok();
+        if !listen.is_empty() && !listen.rsplit_once(':').is_some_and(is_address) {
+            bail!("service.listen is `{listen}`, allowed is HOST:PORT");
+        }
+        if !metrics_listen.is_empty() && metrics_listen.parse::<SocketAddr>().is_err() {
+            bail!("service.metrics_listen is `{metrics_listen}`, allowed is IP:PORT");
+        }
         if self.stop_at_mmer.is_some_and(f64::is_nan) {
             bail!("stop_at_mmer is NaN, allowed is a number");
         }
@@ -256,7 +285,7 @@ fn resolve_memory(table: &mut Table, memories: &memory::Registry) -> anyhow::Res
     let Some(Value::Table(memory)) = table.get_mut("memory") else {
         bail!("memory must be a table such as [memory] name = \"gru\"");
     };
-    let name = text(memory, "name")?.unwrap_or_default().to_owned();
+    let name = text(memory, "name", "memory.")?.unwrap_or_default().to_owned();
     let mut options = memory.clone();
     options.remove("name");
     let entry = memories.get(&name)?;
@@ -264,17 +293,6 @@ fn resolve_memory(table: &mut Table, memories: &memory::Registry) -> anyhow::Res
     *memory = entry.resolve(&options)?;
     memory.insert("name".to_owned(), Value::String(name));
     Ok(())
-}
-
-/// An empty listen address means: any free port for local actors, the usual port where remote ones are waited for.
-fn resolve_listen(table: &mut Table) {
-    if let Some(Value::Table(service)) = table.get_mut(SERVICE) {
-        let remote = service.get("actors").and_then(Value::as_integer) == Some(0);
-        if service.get("listen").and_then(Value::as_str) == Some("") {
-            let address = if remote { "127.0.0.1:50051" } else { "127.0.0.1:0" };
-            service.insert("listen".to_owned(), Value::String(address.to_owned()));
-        }
-    }
 }
 
 /// Puts the keys of `over` over those of `base`, table by table.
@@ -295,6 +313,7 @@ fn check_keys(given: &Table, known: &Table, path: &str) -> anyhow::Result<()> {
         match (known.get(key), value) {
             (Some(_), Value::Table(_)) if path.is_empty() && key == "memory" => {}
             (Some(Value::Table(known)), Value::Table(given)) => check_keys(given, known, &format!("{path}{key}."))?,
+            (Some(Value::Table(_)), other) => bail!("{path}{key} is {other}, allowed is a table: [{key}]"),
             (Some(_), _) => {}
             (None, _) if path.is_empty() && key == "stop_at_mmer" => {}
             (None, _) => {
@@ -320,11 +339,11 @@ fn difference(a: &Table, b: &Table, path: &str) -> Option<String> {
 }
 
 /// The value of a key that must be text, if it is there.
-fn text<'a>(table: &'a Table, key: &str) -> anyhow::Result<Option<&'a str>> {
+fn text<'a>(table: &'a Table, key: &str, path: &str) -> anyhow::Result<Option<&'a str>> {
     match table.get(key) {
         None => Ok(None),
         Some(Value::String(text)) => Ok(Some(text)),
-        Some(other) => bail!("{key} is {other}, allowed is text"),
+        Some(other) => bail!("{path}{key} is {other}, allowed is text"),
     }
 }
 

@@ -33,7 +33,8 @@ impl Interrupt {
                 loop {
                     tokio::select! { _ = ctrl_c.recv() => {}, _ = terminate.recv() => {} }
                     if requested.swap(true, Ordering::SeqCst) {
-                        std::process::exit(i32::from(EXIT_INTERRUPTED));
+                        // Not exit(): that would take libtorch apart while another thread is using it.
+                        signal_hook::low_level::exit(i32::from(EXIT_INTERRUPTED));
                     }
                     tracing::info!("interrupted: saving and stopping; once more stops at once");
                 }

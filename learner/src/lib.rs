@@ -19,6 +19,7 @@ pub mod batch;
 pub mod checkpoint;
 pub mod commands;
 pub mod config;
+mod files;
 pub mod gae;
 pub mod interrupt;
 pub mod local_actors;
@@ -66,21 +67,21 @@ impl Default for Extensions {
 /// Exit status: 0 done, 1 failed, 2 bad usage or configuration, 130 interrupted. Results go to standard output, all else to
 /// standard error.
 pub fn run(extensions: Extensions, arguments: impl IntoIterator<Item = OsString>) -> ExitCode {
+    waiting::settle();
     let args = match Args::try_parse_from(arguments) {
         Ok(args) => args,
         Err(error) => {
-            // Help and version are no errors; clap knows where each goes.
-            let _ = error.print();
-            return ExitCode::from(if error.use_stderr() { 2 } else { 0 });
+            return args::usage(&error);
         }
     };
     let filter = tracing_subscriber::EnvFilter::try_from_default_env().unwrap_or_else(|_| "info".into());
-    tracing_subscriber::fmt()
+    // Fails only where the caller has set up logging already, which is then what it wants.
+    let _ = tracing_subscriber::fmt()
         .with_env_filter(filter)
         .with_writer(Progress::log_writer)
         .with_ansi(std::io::stderr().is_terminal())
         .with_target(false)
-        .init();
+        .try_init();
     let result = match args.command {
         Command::Train(args) => commands::train(&args, extensions),
         Command::Resume(args) => commands::resume(&args, extensions),

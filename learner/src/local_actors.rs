@@ -4,6 +4,8 @@ use std::io;
 use std::os::unix::process::CommandExt as _;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, ExitStatus, Stdio};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{Receiver, RecvTimeoutError, Sender, channel};
 use std::time::{Duration, Instant};
 
@@ -21,12 +23,27 @@ const LONGEST_WAIT: Duration = Duration::from_secs(10);
 /// Actors end by themselves when their standard input ends; those that have not after this long are killed.
 const STOP_DEADLINE: Duration = Duration::from_secs(5);
 
+/// Set when a local actor has failed this often in a row, each time soon after its start: it will never work.
+const HOPELESS_FAILURES: u32 = 6;
+
+/// Whether local actors fail again and again.
+#[derive(Clone, Debug, Default)]
+pub struct Hopeless(Arc<AtomicBool>);
+
+impl Hopeless {
+    /// Whether it has come to that.
+    pub fn is_set(&self) -> bool {
+        self.0.load(Ordering::Relaxed)
+    }
+}
+
 /// A number of actor processes. Dropping it stops them all.
 #[derive(Debug)]
 pub struct LocalActors {
     /// Dropped to stop.
     stop: Option<Sender<()>>,
     watcher: Option<std::thread::JoinHandle<()>>,
+    hopeless: Hopeless,
 }
 
 impl LocalActors {
@@ -44,18 +61,25 @@ impl LocalActors {
         let mut actors = Vec::with_capacity(n);
         for _ in 0..n {
             match start(&program, &args) {
-                Ok(child) => actors.push(Actor { child: Some(child), since: now, wait: FIRST_WAIT }),
+                Ok(child) => actors.push(Actor { child: Some(child), since: now, wait: FIRST_WAIT, failures: 0 }),
                 Err(error) => {
                     stop_all(actors);
                     return Err(error).with_context(|| format!("cannot start {}", program.display()));
                 }
             }
         }
+        let hopeless = Hopeless::default();
         let (stop, stopped) = channel();
-        let watcher = std::thread::Builder::new()
-            .name("local-actors".to_owned())
-            .spawn(move || watch(actors, &program, &args, &stopped))?;
-        Ok(Self { stop: Some(stop), watcher: Some(watcher) })
+        let watcher = std::thread::Builder::new().name("local-actors".to_owned()).spawn({
+            let hopeless = hopeless.clone();
+            move || watch(actors, &program, &args, &stopped, &hopeless)
+        })?;
+        Ok(Self { stop: Some(stop), watcher: Some(watcher), hopeless })
+    }
+
+    /// Tells when they fail again and again.
+    pub fn hopeless(&self) -> Hopeless {
+        self.hopeless.clone()
     }
 
     /// Stops all and waits until they are gone, a few seconds at most.
@@ -81,6 +105,8 @@ struct Actor {
     since: Instant,
     /// How long to wait after its death.
     wait: Duration,
+    /// How often it failed in a row, soon after its start.
+    failures: u32,
 }
 
 fn start(program: &Path, args: &[String]) -> io::Result<Child> {
@@ -96,11 +122,12 @@ fn start(program: &Path, args: &[String]) -> io::Result<Child> {
     command.spawn()
 }
 
-fn watch(mut actors: Vec<Actor>, program: &Path, args: &[String], stopped: &Receiver<()>) {
+fn watch(mut actors: Vec<Actor>, program: &Path, args: &[String], stopped: &Receiver<()>, hopeless: &Hopeless) {
     // The sender sends nothing; it is dropped.
     while matches!(stopped.recv_timeout(POLL_INTERVAL), Err(RecvTimeoutError::Timeout)) {
         for actor in &mut actors {
             actor.look_after(program, args);
+            hopeless.0.fetch_or(actor.failures >= HOPELESS_FAILURES, Ordering::Relaxed);
         }
     }
     stop_all(actors);
@@ -120,7 +147,10 @@ impl Actor {
                     // Told by the learner that the run is complete: the end is near.
                     self.died(LONGEST_WAIT);
                 } else {
-                    let wait = if self.since.elapsed() > LONGEST_WAIT { FIRST_WAIT } else { self.wait };
+                    let (wait, failures) =
+                        if self.since.elapsed() > LONGEST_WAIT { (FIRST_WAIT, 0) } else { (self.wait, self.failures) };
+                    // A signal is somebody's doing, not the actor's own failure.
+                    self.failures = failures + u32::from(status.is_some_and(|status| status.code().is_some()));
                     warn!("a local actor has died ({}); another is started in {wait:?}", describe(status));
                     self.died(wait);
                 }

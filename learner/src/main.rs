@@ -3,6 +3,5 @@
 use std::process::ExitCode;
 
 fn main() -> ExitCode {
-    popgym_learner::waiting::settle();
     popgym_learner::run(popgym_learner::Extensions::default(), std::env::args_os())
 }

@@ -104,7 +104,9 @@ impl Quick {
         let longest = i64::from(env.max_steps);
         // 64 of the longest episodes, but never so few steps that an update is noise, nor more than a second or two of
         // sampling.
-        let batch_steps = (64 * longest).clamp(8_192, (16 * longest).max(16_384));
+        // A batch ends with a whole episode, so it may be an episode longer.
+        let most = (16 * longest).max(16_384) - (longest - 1);
+        let batch_steps = (64 * longest).clamp(8_192.min(most), most);
         // A tenth of the episode: the longer the game, the farther its consequences.
         let horizon = (longest as f64 / 10.0).clamp(10.0, 100.0);
         // Returns are within about +-1 and earned over the whole episode: this makes what is earned within the horizon, which

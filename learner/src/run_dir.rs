@@ -1,5 +1,6 @@
 //! A run's directory: where its files are, and that only one learner works in it.
 
+use std::ffi::OsStr;
 use std::fs::{self, File, TryLockError};
 use std::path::{Path, PathBuf};
 
@@ -8,6 +9,7 @@ use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 
 use crate::config::Config;
+use crate::files;
 
 /// A run directory that this process holds the lock of.
 pub struct RunDir {
@@ -26,21 +28,21 @@ impl RunDir {
     /// Makes `path` the directory of a new run: writes its configuration and identity.
     ///
     /// # Errors
-    /// `path` already holds a run or other files, or cannot be written.
+    /// `path` holds a run or other files, or cannot be written, or another learner is working in it.
     pub fn create(path: &Path, config: &Config) -> anyhow::Result<Self> {
         fs::create_dir_all(path).with_context(|| format!("cannot create the run directory {}", path.display()))?;
-        if Self::holds_run(path) {
-            bail!("{} already holds a run; `learner resume {0}` continues it, as does `--continue`", path.display());
-        }
-        let mut entries = fs::read_dir(path).with_context(|| format!("cannot read {}", path.display()))?;
-        if let Some(entry) = entries.find_map(Result::ok).filter(|entry| entry.file_name() != "lock") {
+        let lock = lock(path)?;
+        let mut entries = fs::read_dir(path).with_context(|| format!("cannot read {}", path.display()))?.flatten();
+        // What a learner leaves that was killed before it had written a configuration is no obstacle.
+        let ours =
+            |name: &OsStr| name == "lock" || name == "run.json" || name.to_string_lossy().starts_with(".partial-");
+        if let Some(entry) = entries.find(|entry| !ours(&entry.file_name())) {
             bail!("{} is not empty (it holds {}); choose a new directory", path.display(), entry.file_name().display());
         }
-        let lock = lock(path)?;
         let run = fresh_run_id(path);
-        write(&path.join("run.json"), &serde_json::to_string_pretty(&Identity { run: run.clone() })?)?;
+        files::write(&path.join("run.json"), &serde_json::to_string_pretty(&Identity { run: run.clone() })?)?;
         // Last: a directory with a configuration is a run.
-        write(&path.join("config.toml"), &config.to_toml()?)?;
+        files::write(&path.join("config.toml"), &config.to_toml()?)?;
         Ok(Self { path: path.to_owned(), run, _lock: lock })
     }
 
@@ -109,15 +111,4 @@ fn lock(path: &Path) -> anyhow::Result<File> {
         Err(TryLockError::WouldBlock) => bail!("another learner is working in {}", path.display()),
         Err(TryLockError::Error(error)) => Err(error).with_context(|| format!("cannot lock {}", file.display())),
     }
-}
-
-/// Writes a small file under a temporary name, syncs it and renames it.
-pub(crate) fn write(path: &Path, text: &str) -> anyhow::Result<()> {
-    let temporary = path.with_extension("tmp");
-    let write = || {
-        fs::write(&temporary, text)?;
-        File::open(&temporary)?.sync_all()?;
-        fs::rename(&temporary, path)
-    };
-    write().with_context(|| format!("cannot write {}", path.display()))
 }

@@ -5,14 +5,15 @@ use std::net::TcpListener;
 use std::path::PathBuf;
 
 use anyhow::Context;
-use popgym_envs::EnvSpec;
+use popgym_envs::{EnvSpec, Purpose, stream};
 use popgym_models::{Policy, PolicySpec, memory};
 use popgym_proto::{EpisodeSpec, fingerprint};
+use rand::Rng as _;
 use tch::Device;
 
 use crate::Extensions;
 use crate::config::Config;
-use crate::local_actors::LocalActors;
+use crate::local_actors::{Hopeless, LocalActors};
 use crate::service::Service;
 
 /// One learner at work, with its actors.
@@ -23,6 +24,7 @@ pub struct Session<'a> {
     memories: memory::Registry,
     device: Device,
     parameters: i64,
+    listener: Option<TcpListener>,
     service: Option<Service>,
     actors: Option<LocalActors>,
 }
@@ -44,13 +46,11 @@ impl<'a> Session<'a> {
             memories: extensions.memories.clone(),
             device,
             parameters: 0,
+            listener: None,
             service: None,
             actors: None,
         };
         session.parameters = session.policy()?.parameters().values().map(|tensor| tensor.numel() as i64).sum();
-        if !config.service.metrics_listen.is_empty() {
-            serve_metrics(&config.service.metrics_listen)?;
-        }
         Ok(session)
     }
 
@@ -72,13 +72,48 @@ impl<'a> Session<'a> {
         Ok(Policy::new(&self.policy_spec, &self.memories, self.device)?)
     }
 
-    /// Starts listening for actors of the run called `run`, and starts the local ones.
+    /// The run's first policy. Its weights are drawn on the CPU whatever the device, from libtorch's generator seeded with
+    /// the run's stream of weights.
     ///
     /// # Errors
-    /// The address cannot be listened on, or the actors cannot be started.
-    pub fn serve(&mut self, run: &str, evaluation: bool) -> anyhow::Result<()> {
-        let listen = &self.config.service.listen;
+    /// The policy cannot be built.
+    pub fn first_policy(&self) -> anyhow::Result<Policy> {
+        let seed = stream(self.config.seed, 0, 0, Purpose::Weights).next_u64();
+        tch::manual_seed((seed >> 1) as i64);
+        let drawn = Policy::new(&self.policy_spec, &self.memories, Device::Cpu)?;
+        let mut policy = self.policy()?;
+        policy.load(&drawn.to_bytes())?;
+        Ok(policy)
+    }
+
+    /// Takes the addresses that the run needs, and looks for the program of the local actors.
+    ///
+    /// # Errors
+    /// An address that cannot be had, or no such program.
+    pub fn listen(&mut self) -> anyhow::Result<()> {
+        let service = &self.config.service;
+        if service.actors > 0 {
+            actor_program()?;
+        }
+        let listen = match (service.listen.as_str(), service.actors) {
+            ("", 0) => "127.0.0.1:50051",
+            ("", _) => "127.0.0.1:0",
+            (address, _) => address,
+        };
         let listener = TcpListener::bind(listen).with_context(|| format!("cannot listen for actors on {listen}"))?;
+        self.listener = Some(listener);
+        if service.metrics_listen.is_empty() { Ok(()) } else { serve_metrics(&service.metrics_listen) }
+    }
+
+    /// Starts serving actors of the run called `run`, and starts the local ones.
+    ///
+    /// # Errors
+    /// As [`Session::listen`], if that was not called before; or the actors cannot be started.
+    pub fn serve(&mut self, run: &str, evaluation: bool) -> anyhow::Result<()> {
+        if self.listener.is_none() {
+            self.listen()?;
+        }
+        let listener = self.listener.take().context("no listening address")?;
         let address = listener.local_addr()?;
         let policy = self.policy()?;
         let spec = self.config.run_spec(run, evaluation)?;
@@ -108,6 +143,11 @@ impl<'a> Session<'a> {
             tracing::info!("waiting for actors: actor --learner http://{address}");
         }
         Ok(())
+    }
+
+    /// Tells when the local actors fail again and again.
+    pub fn hopeless(&self) -> Hopeless {
+        self.actors.as_ref().map(LocalActors::hopeless).unwrap_or_default()
     }
 
     /// The service for actors.

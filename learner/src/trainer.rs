@@ -20,6 +20,7 @@ use crate::batch::Batch;
 use crate::checkpoint::{self, Checkpoint, Progress};
 use crate::config::{Config, LearningRateSchedule};
 use crate::interrupt::Interrupt;
+use crate::local_actors::Hopeless;
 use crate::observer::{EpochMetrics, EpochReport, EpochTiming, Observer, Summary};
 use crate::service::{Service, Target};
 use crate::update::{self, Schedule, UpdateError, UpdateMeans};
@@ -45,6 +46,8 @@ pub struct Trainer<'a> {
     pub checkpoints: PathBuf,
     /// Set when the user wants to stop.
     pub interrupt: &'a Interrupt,
+    /// Set when local actors cannot work.
+    pub hopeless: Hopeless,
 }
 
 /// The state of a run while it goes on.
@@ -69,21 +72,22 @@ impl Trainer<'_> {
         let mut state = self.start(from)?;
         self.open(&state)?;
         let stopped_by = loop {
-            if let Some(reason) = self.reached(&state.progress) {
+            if let Some(reason) = self.config.reached(&state.progress) {
                 break reason;
             }
             match self.epoch(&mut state) {
                 Ok(true) => {}
                 Ok(false) => break "interrupt",
                 Err(error) => {
-                    self.save(&mut state);
+                    let _ = self.save(&mut state);
                     return Err(error);
                 }
             }
         };
-        self.save(&mut state);
+        let saved = self.save(&mut state);
         let summary = self.summary(&state, stopped_by);
         self.tell(|observer| observer.run_end(&summary));
+        anyhow::ensure!(saved, "the run ended, but its last checkpoint could not be written");
         Ok(summary)
     }
 
@@ -127,20 +131,10 @@ impl Trainer<'_> {
         })
     }
 
-    /// Why the run is complete, if it is.
-    fn reached(&self, progress: &Progress) -> Option<&'static str> {
-        let target = self.config.stop_at_mmer.unwrap_or(f64::INFINITY);
-        if progress.mmer.is_some_and(|mmer| mmer >= target) {
-            Some("mmer")
-        } else {
-            (progress.env_steps >= self.config.steps).then_some("steps")
-        }
-    }
-
     /// Opens the sampling of the next epoch.
     fn open(&self, state: &State) -> anyhow::Result<()> {
         let epoch = state.progress.epoch;
-        if self.reached(&state.progress).is_some() {
+        if self.config.reached(&state.progress).is_some() {
             return Ok(());
         }
         self.open_epoch(epoch, epoch.saturating_sub(u64::from(self.config.lag)), state.snapshot.sampling.clone())
@@ -153,7 +147,10 @@ impl Trainer<'_> {
     /// One epoch. False: interrupted, and the state is that before the epoch.
     fn epoch(&mut self, state: &mut State) -> anyhow::Result<bool> {
         let began = Instant::now();
-        let Some(collected) = self.service.collect(|| self.interrupt.requested()) else {
+        let stop = || self.interrupt.requested() || self.hopeless.is_set();
+        let Some(collected) = self.service.collect(stop) else {
+            anyhow::ensure!(!self.hopeless.is_set(), "local actors fail again and again; see their messages above");
+            anyhow::ensure!(self.interrupt.requested(), "the service for actors has died");
             return Ok(false);
         };
         let wait_seconds = began.elapsed().as_secs_f64();
@@ -164,7 +161,7 @@ impl Trainer<'_> {
         // COLLECTED: with lag 1 the next epoch is sampled from here on, with the weights as they are now.
         let pipelined = self.config.lag == 1;
         let newest = state.snapshot.weights.clone();
-        if pipelined && self.reached(&state.progress).is_none() {
+        if pipelined && self.config.reached(&state.progress).is_none() {
             self.open_epoch(epoch + 1, epoch, newest.clone())?;
         }
 
@@ -207,10 +204,14 @@ impl Trainer<'_> {
         state.progress.kl_coef = update::next_kl_coef(state.progress.kl_coef, means.kl, ppo.kl_target);
         state.progress.wall_seconds = state.earlier_seconds + state.started.elapsed().as_secs_f64();
         let optimizer = copy_moments(state.adam.state());
+        if !pipelined {
+            // Refuses weights that are not finite, before the snapshot becomes what a checkpoint holds.
+            self.behaviour.load(&sampling)?;
+        }
         state.snapshot = Checkpoint { progress: state.progress.clone(), weights, sampling, optimizer };
+
         if !pipelined {
             self.open(state)?;
-            self.behaviour.load(&state.snapshot.sampling)?;
         }
 
         // REPORT AND SAVE: the row of metrics first, so that a checkpoint never stands without it.
@@ -232,7 +233,7 @@ impl Trainer<'_> {
         let report = EpochReport { metrics, timing };
         self.tell(|observer| observer.epoch(&report));
         if state.progress.epoch.is_multiple_of(self.config.checkpoint_epochs) {
-            self.save(state);
+            let _ = self.save(state);
         }
         Ok(true)
     }
@@ -247,11 +248,11 @@ impl Trainer<'_> {
         Schedule { learning_rate: ppo.learning_rate * factor, kl_coef: progress.kl_coef }
     }
 
-    /// Writes a checkpoint of the last completed epoch, if there is none yet. A failure is reported; the run goes on.
-    fn save(&mut self, state: &mut State) {
+    /// Writes a checkpoint of the last completed epoch, if there is none yet. A failure is reported, and false.
+    fn save(&mut self, state: &mut State) -> bool {
         let epoch = state.snapshot.progress.epoch;
         if epoch == 0 || state.saved_epoch == Some(epoch) {
-            return;
+            return true;
         }
         let about = BTreeMap::from([
             ("env".to_owned(), self.config.env.clone()),
@@ -259,18 +260,19 @@ impl Trainer<'_> {
             ("preset".to_owned(), self.config.preset.clone()),
             ("build".to_owned(), env!("CARGO_PKG_VERSION").to_owned()),
         ]);
-        let saved = state.snapshot.save(&self.checkpoints, &about).and_then(|path| {
-            checkpoint::prune(&self.checkpoints, self.config.keep_checkpoints as usize)?;
-            Ok(path)
-        });
-        match saved {
+        match state.snapshot.save(&self.checkpoints, &about) {
             Ok(path) => {
                 state.saved_epoch = Some(epoch);
                 self.tell(|observer| observer.checkpoint(epoch, &path));
+                if let Err(error) = checkpoint::prune(&self.checkpoints, self.config.keep_checkpoints as usize) {
+                    tracing::warn!("old checkpoints not removed: {error:#}");
+                }
+                true
             }
             Err(error) => {
                 metrics::counter!("popgym_learner_checkpoint_failures_total").increment(1);
                 tracing::error!("checkpoint of epoch {epoch} not written: {error:#}");
+                false
             }
         }
     }

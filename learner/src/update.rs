@@ -101,7 +101,8 @@ pub struct Schedule {
     pub kl_coef: f64,
 }
 
-/// The KL coefficient of the next epoch, given the mean KL of this one's update: half again as large above twice the
+/// The KL coefficient of the next epoch, given the mean KL of this one's update (a mean over steps, where RLlib takes one
+/// over its minibatches): half again as large above twice the
 /// target, half below half of it (Schulman et al., 2017, section 4, with RLlib's factors).
 pub fn next_kl_coef(kl_coef: f64, kl: f64, kl_target: f64) -> f64 {
     if kl > 2.0 * kl_target {

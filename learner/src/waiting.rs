@@ -9,17 +9,17 @@
 use std::os::unix::process::CommandExt;
 use std::process::Command;
 
-/// The settings, unless the user has made them: OpenMP's bounded spin; and MKL keeps to the number of threads it is told,
-/// because that number decides the order of sums.
-const SETTINGS: [(&str, &str); 2] = [("GOMP_SPINCOUNT", "10000"), ("MKL_DYNAMIC", "FALSE")];
-
-/// Settings of the user's own that stand in the place of ours.
-const USERS: [&str; 2] = ["GOMP_SPINCOUNT", "OMP_WAIT_POLICY"];
+/// Each setting, with the variables of the user's own that stand in its place: OpenMP's bounded spin; and that MKL keeps to
+/// the number of threads it is told, because that number decides the order of sums.
+const SETTINGS: [(&str, &str, &[&str]); 2] =
+    [("GOMP_SPINCOUNT", "10000", &["GOMP_SPINCOUNT", "OMP_WAIT_POLICY"]), ("MKL_DYNAMIC", "FALSE", &["MKL_DYNAMIC"])];
 
 /// Replaces this process by itself with the settings in its environment, unless they are there. Where that fails, the
 /// program goes on as it is, only slower.
 pub fn settle() {
-    if USERS.iter().any(|name| std::env::var_os(name).is_some()) {
+    let is_set = |name: &&str| std::env::var_os(name).is_some();
+    let mut missing = SETTINGS.iter().filter(|(_, _, own)| !own.iter().any(is_set)).peekable();
+    if missing.peek().is_none() {
         return;
     }
     let Ok(program) = std::env::current_exe() else { return };
@@ -28,6 +28,6 @@ pub fn settle() {
     if let Some(name) = arguments.next() {
         command.arg0(name);
     }
-    let error = command.args(arguments).envs(SETTINGS).exec();
-    eprintln!("cannot start again with {SETTINGS:?}: {error}");
+    let error = command.args(arguments).envs(missing.map(|(name, value, _)| (name, value))).exec();
+    tracing::warn!("cannot start again with bounded spinning: {error}");
 }

@@ -4,7 +4,7 @@ use bytes::Bytes;
 use popgym_proto::Episode;
 use serde::Serialize;
 
-use super::{Failure, Outcome};
+use super::{Failure, Outcome, say};
 use crate::Extensions;
 use crate::args::{EvalArgs, Which};
 use crate::checkpoint::{self, Checkpoint};
@@ -45,17 +45,19 @@ pub fn eval(args: &EvalArgs, extensions: &Extensions) -> Outcome {
     let service = session.service()?;
     let epoch = checkpoint.progress.epoch;
     service.open(0, epoch, Bytes::clone(&checkpoint.weights), Target::Episodes(args.episodes))?;
-    let collected = service.collect(|| interrupt.requested());
+    let hopeless = session.hopeless();
+    let collected = service.collect(|| interrupt.requested() || hopeless.is_set());
     session.end(Some("the evaluation is complete"));
     let Some(collected) = collected else {
-        return Ok(EXIT_INTERRUPTED);
+        if interrupt.requested() {
+            return Ok(EXIT_INTERRUPTED);
+        }
+        return Err(Failure::Run(anyhow::anyhow!("the actors could not do their work")));
     };
     let report = report(&config, epoch, &collected.episodes);
-    if args.json {
-        println!("{}", serde_json::to_string_pretty(&report).map_err(anyhow::Error::from)?);
-    } else {
-        print(&report);
-    }
+    let text =
+        if args.json { serde_json::to_string_pretty(&report).map_err(anyhow::Error::from)? } else { lines(&report) };
+    say(&text)?;
     Ok(0)
 }
 
@@ -70,6 +72,7 @@ fn configure(args: &EvalArgs, extensions: &Extensions) -> anyhow::Result<Config>
     config.service.actors = args.actors;
     "127.0.0.1:0".clone_into(&mut config.service.listen);
     config.service.metrics_listen.clear();
+    config.validate()?;
     Ok(config)
 }
 
@@ -107,10 +110,13 @@ fn report(config: &Config, checkpoint_epoch: u64, episodes: &[Episode]) -> Repor
     }
 }
 
-fn print(report: &Report) {
-    println!("{} on {}, weights of epoch {}", report.memory, report.env, report.checkpoint_epoch);
-    println!("episodes     {} (seed {})", report.episodes, report.seed);
-    println!("mean return  {:.4} +- {:.4} (standard error)", report.mean_return, report.standard_error);
-    println!("min, median, max  {:.4}  {:.4}  {:.4}", report.min_return, report.median_return, report.max_return);
-    println!("mean length  {:.1} steps", report.mean_length);
+fn lines(report: &Report) -> String {
+    [
+        format!("{} on {}, weights of epoch {}", report.memory, report.env, report.checkpoint_epoch),
+        format!("episodes           {} (seed {})", report.episodes, report.seed),
+        format!("mean return        {:.4} +- {:.4} (standard error)", report.mean_return, report.standard_error),
+        format!("min, median, max   {:.4}  {:.4}  {:.4}", report.min_return, report.median_return, report.max_return),
+        format!("mean length        {:.1} steps", report.mean_length),
+    ]
+    .join("\n")
 }

@@ -2,7 +2,7 @@
 
 use serde_json::json;
 
-use super::{Failure, Outcome};
+use super::{Outcome, say};
 use crate::Extensions;
 use crate::args::{ListArgs, Listed};
 use crate::config::PRESETS;
@@ -13,24 +13,23 @@ use crate::config::PRESETS;
 /// None that can be caused from outside.
 pub fn list(args: &ListArgs, extensions: &Extensions) -> Outcome {
     if args.json {
-        let json = serde_json::to_string_pretty(&as_json(args.what, extensions));
-        println!("{}", json.map_err(|error| Failure::Run(error.into()))?);
+        say(&format!("{:#}", as_json(args.what, extensions)))?;
         return Ok(0);
     }
     match args.what {
         Listed::Envs => {
             for entry in &extensions.envs {
-                println!("{:<28} {:<11} {}", entry.name, entry.group, entry.id());
+                say(&format!("{:<28} {:<11} {}", entry.name, entry.group, entry.id()))?;
             }
         }
         Listed::Memories => {
             for entry in extensions.memories.entries() {
-                println!("{:<12} {}", entry.name, entry.paper_name);
+                say(&format!("{:<12} {}", entry.name, entry.paper_name))?;
             }
         }
         Listed::Presets => {
             for (name, about) in PRESETS {
-                println!("{name:<12} {about}");
+                say(&format!("{name:<12} {about}"))?;
             }
         }
     }

@@ -1,5 +1,7 @@
 //! The user's commands.
 
+use std::io::{ErrorKind, Write};
+
 mod eval;
 mod list;
 mod train;
@@ -20,6 +22,14 @@ pub enum Failure {
 impl From<anyhow::Error> for Failure {
     fn from(error: anyhow::Error) -> Self {
         Self::Run(error)
+    }
+}
+
+/// Writes `text` and a line's end to standard output. That nobody reads it is no failure.
+fn say(text: &str) -> anyhow::Result<()> {
+    match writeln!(std::io::stdout(), "{text}") {
+        Err(error) if error.kind() != ErrorKind::BrokenPipe => Err(error.into()),
+        _ => Ok(()),
     }
 }
 

@@ -2,19 +2,19 @@
 
 use std::path::{Path, PathBuf};
 
-use anyhow::Context;
-use popgym_envs::{Purpose, stream};
-use rand::Rng as _;
 use tch::Device;
 
-use super::{Failure, Outcome};
+use super::{Failure, Outcome, say};
 use crate::Extensions;
 use crate::args::{ResumeArgs, TrainArgs};
 use crate::checkpoint::Checkpoint;
 use crate::config::{self, Config};
+use crate::files;
 use crate::interrupt::{EXIT_INTERRUPTED, Interrupt};
-use crate::observer::{Curve, MetricsCsv, Observer, Progress, Prometheus, RunStart, TensorBoard, TimingCsv};
-use crate::run_dir::{self, RunDir};
+use crate::observer::{
+    Curve, MetricsCsv, Observer, Progress, Prometheus, RunStart, Summary, SummaryJson, TensorBoard, TimingCsv,
+};
+use crate::run_dir::RunDir;
 use crate::session::Session;
 use crate::trainer::Trainer;
 
@@ -25,12 +25,20 @@ use crate::trainer::Trainer;
 pub fn train(args: &TrainArgs, extensions: Extensions) -> Outcome {
     let config = configure(args, &extensions).map_err(Failure::Usage)?;
     let path = args.out.clone().unwrap_or_else(|| RunDir::fresh(&config));
-    let dir = if args.continue_run && RunDir::holds_run(&path) {
-        continue_run(&path, &config, &extensions)?
-    } else {
-        create(&path, &config)?
-    };
-    carry_out(&dir, &config, extensions)
+    if RunDir::holds_run(&path) {
+        if !args.continue_run {
+            let hint = format!("`learner resume {}` continues it, as does `--continue`", path.display());
+            return Err(Failure::Usage(anyhow::anyhow!("{} already holds a run; {hint}", path.display())));
+        }
+        let dir = continue_run(&path, &config, &extensions)?;
+        let session = Session::new(&config, &extensions)?;
+        return carry_out(&dir, session, &config, extensions);
+    }
+    // What can fail for want of an address or a program does so before there is a directory.
+    let mut session = Session::new(&config, &extensions)?;
+    session.listen()?;
+    let dir = RunDir::create(&path, &config)?;
+    carry_out(&dir, session, &config, extensions)
 }
 
 /// Continues the run of a directory from its last checkpoint, or from the beginning if it has none.
@@ -48,15 +56,19 @@ pub fn resume(args: &ResumeArgs, extensions: Extensions) -> Outcome {
     let flags = args.table().map_err(Failure::Usage)?;
     let mut config = load(&flags).map_err(Failure::Usage)?;
     resolve_device(&mut config).map_err(Failure::Usage)?;
-    // What was asked for now is what the directory says from now on.
-    run_dir::write(&config_path, &config.to_toml()?)?;
-    carry_out(&dir, &config, extensions)
+    let session = Session::new(&config, &extensions)?;
+    carry_out(&dir, session, &config, extensions)
 }
 
 fn configure(args: &TrainArgs, extensions: &Extensions) -> anyhow::Result<Config> {
     let file = args.config.as_deref().map_or_else(|| Ok(toml::Table::new()), config::read_table)?;
-    let mut config = Config::resolve(&file, &args.table()?, &extensions.envs, &extensions.memories)
-        .with_context(|| args.config.as_ref().map_or_else(|| "flags".to_owned(), |path| path.display().to_string()))?;
+    let flags = args.table()?;
+    let resolve = |flags: &toml::Table| Config::resolve(&file, flags, &extensions.envs, &extensions.memories);
+    let mut config = resolve(&flags).map_err(|error| match &args.config {
+        // The file is to blame only for what is wrong without the flags too.
+        Some(path) if resolve(&toml::Table::new()).is_err() => error.context(path.display().to_string()),
+        _ => error,
+    })?;
     resolve_device(&mut config)?;
     Ok(config)
 }
@@ -68,21 +80,12 @@ fn resolve_device(config: &mut Config) -> anyhow::Result<()> {
     Ok(())
 }
 
-fn create(path: &Path, config: &Config) -> Result<RunDir, Failure> {
-    if RunDir::holds_run(path) {
-        return Err(Failure::Usage(anyhow::anyhow!(
-            "{0} already holds a run; `learner resume {0}` continues it, as does `--continue`",
-            path.display()
-        )));
-    }
-    RunDir::create(path, config).map_err(Failure::Run)
-}
-
 /// Opens a directory that holds a run, if it is the same run as `config`'s.
 fn continue_run(path: &Path, config: &Config, extensions: &Extensions) -> Result<RunDir, Failure> {
     let dir = RunDir::open(path)?;
     let none = toml::Table::new();
-    let theirs = Config::load(&RunDir::config_path(path), &none, &extensions.envs, &extensions.memories)?;
+    let theirs = Config::load(&RunDir::config_path(path), &none, &extensions.envs, &extensions.memories)
+        .map_err(Failure::Usage)?;
     match config.difference(&theirs) {
         None => Ok(dir),
         Some(difference) => {
@@ -93,19 +96,16 @@ fn continue_run(path: &Path, config: &Config, extensions: &Extensions) -> Result
 }
 
 /// Runs what `config` says in `dir`, from the directory's last checkpoint if it has one.
-fn carry_out(dir: &RunDir, config: &Config, extensions: Extensions) -> Outcome {
+fn carry_out(dir: &RunDir, mut session: Session<'_>, config: &Config, extensions: Extensions) -> Outcome {
     let interrupt = Interrupt::listen()?;
-    let mut session = Session::new(config, &extensions)?;
     let checkpoint = Checkpoint::latest(&dir.checkpoints(), session.parameters())?;
     if let Some(path) = complete(dir, config, checkpoint.as_ref()) {
-        println!("already complete: {}", path.display());
+        say(&format!("already complete: {}", path.display()))?;
         return Ok(0);
     }
-    // The same first weights on every machine: libtorch's own generator is seeded from the run's stream of weights.
-    let seed = stream(config.seed, 0, 0, Purpose::Weights).next_u64();
-    tch::manual_seed((seed >> 1) as i64);
-    let policy = session.policy()?;
-    let behaviour = session.policy()?;
+    // What was asked for now is what the directory says from now on.
+    files::write(&RunDir::config_path(dir.path()), &config.to_toml()?)?;
+    let (policy, behaviour) = (session.first_policy()?, session.policy()?);
     let observers = observers(dir, config, checkpoint.as_ref(), extensions.observers)?;
     session.serve(dir.run(), false)?;
     let trainer = Trainer {
@@ -117,20 +117,21 @@ fn carry_out(dir: &RunDir, config: &Config, extensions: Extensions) -> Outcome {
         observers,
         checkpoints: dir.checkpoints(),
         interrupt: &interrupt,
+        hopeless: session.hopeless(),
     };
     let summary = trainer.run(checkpoint)?;
     let interrupted = summary.stopped_by == "interrupt";
     session.end(if interrupted { None } else { Some("the run is complete") });
-    run_dir::write(&dir.path().join("summary.json"), &serde_json::to_string_pretty(&summary).unwrap_or_default())?;
     Ok(if interrupted { EXIT_INTERRUPTED } else { 0 })
 }
 
-/// The summary of a run that has nothing left to do.
+/// The summary of a run that has nothing left to do: it is of the newest checkpoint, and that is far enough.
 fn complete(dir: &RunDir, config: &Config, checkpoint: Option<&Checkpoint>) -> Option<PathBuf> {
     let progress = &checkpoint?.progress;
-    let target = config.stop_at_mmer.unwrap_or(f64::INFINITY);
-    let done = progress.env_steps >= config.steps || progress.mmer.is_some_and(|mmer| mmer >= target);
-    done.then(|| dir.path().join("summary.json")).filter(|path| path.exists())
+    let path = dir.path().join(SummaryJson::FILE);
+    let summary: Summary = serde_json::from_slice(&std::fs::read(&path).ok()?).ok()?;
+    let ended = summary.epochs == progress.epoch && summary.stopped_by != "interrupt";
+    (ended && config.reached(progress).is_some()).then_some(path)
 }
 
 fn observers(
@@ -144,6 +145,7 @@ fn observers(
     let mut observers: Vec<Box<dyn Observer>> = vec![
         Box::new(MetricsCsv::open(dir.path(), epochs)?),
         Box::new(TimingCsv::open(dir.path(), epochs)?),
+        Box::new(SummaryJson::new()),
         Box::new(TensorBoard::new()),
         Box::new(Prometheus::new()),
     ];

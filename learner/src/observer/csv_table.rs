@@ -9,7 +9,7 @@ use anyhow::{Context as _, bail, ensure};
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 
-use super::files::{self, AppendFile};
+use crate::files::{self, AppendFile};
 
 /// A row of a table.
 pub(super) trait Row: Serialize + DeserializeOwned {

@@ -4,8 +4,8 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
-use super::files::replace;
 use super::{EpochMetrics, EpochReport, MetricsCsv, Observer, RunStart, Summary, chart};
+use crate::files::replace;
 
 /// Pictures are at least this far apart, but for the last.
 const INTERVAL: Duration = Duration::from_mins(1);

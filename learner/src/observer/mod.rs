@@ -9,12 +9,12 @@ use serde::{Deserialize, Serialize};
 mod chart;
 mod csv_table;
 mod curve;
-mod files;
 mod metrics_csv;
 mod progress;
 mod prometheus;
 #[cfg(test)]
 mod samples;
+mod summary_json;
 mod tensorboard;
 mod timing_csv;
 
@@ -22,6 +22,7 @@ pub use curve::Curve;
 pub use metrics_csv::MetricsCsv;
 pub use progress::Progress;
 pub use prometheus::Prometheus;
+pub use summary_json::SummaryJson;
 pub use tensorboard::TensorBoard;
 pub use timing_csv::TimingCsv;
 

@@ -22,6 +22,11 @@ impl Prometheus {
         describe_gauge!("popgym_learner_run_info", "What is trained, in labels; always 1.");
         describe_gauge!("popgym_learner_target_steps", Unit::Count, "Environment steps after which the run stops.");
         describe_counter!("popgym_learner_epochs_total", Unit::Count, "Epochs completed.");
+        describe_counter!(
+            "popgym_learner_checkpoint_failures_total",
+            Unit::Count,
+            "Checkpoints that could not be written."
+        );
         describe_gauge!("popgym_learner_weights_version", Unit::Count, "Epochs of training in the newest weights.");
         describe_counter!("popgym_learner_env_steps_total", Unit::Count, "Environment steps of completed epochs.");
         describe_counter!("popgym_learner_episodes_total", Unit::Count, "Episodes of completed epochs.");

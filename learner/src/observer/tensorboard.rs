@@ -6,8 +6,8 @@ use std::time::{SystemTime, UNIX_EPOCH};
 use anyhow::Context as _;
 use prost::Message as _;
 
-use super::files::AppendFile;
 use super::{EpochReport, Observer, RunStart, Summary};
+use crate::files::AppendFile;
 
 /// Writes scalars to an event file in `tensorboard/` in the run directory. Their x axis is environment steps.
 ///

@@ -6,7 +6,7 @@
 
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::sync::Arc;
-use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
+use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::Instant;
 
 use popgym_proto::{Episode, EpisodeBatch, Hello, Leases, OpenEpoch, WeightSet, limits};
@@ -37,7 +37,6 @@ pub(super) enum Event {
 #[derive(Debug, Default)]
 pub(super) struct Shared {
     pub(super) actors: AtomicUsize,
-    pub(super) prefix_steps: AtomicU64,
 }
 
 /// Names of actors that are remembered, to tell who returns. Beyond, an actor that returns looks new; nothing else.
@@ -228,7 +227,7 @@ impl Coordinator {
         for session in self.sessions.values_mut() {
             session.held.clear();
         }
-        self.shared.prefix_steps.store(0, Ordering::Relaxed);
+        metrics::opened(epoch, weights.version);
         self.epoch = Some(Epoch {
             number: epoch,
             weights,
@@ -267,7 +266,6 @@ impl Coordinator {
             self.length.see(episode.steps);
             epoch.accept(episode);
         }
-        self.shared.prefix_steps.store(epoch.prefix_steps, Ordering::Relaxed);
     }
 
     /// Where the prefix is a batch: hands it to the trainer, and calls off what is under way.
@@ -280,7 +278,6 @@ impl Coordinator {
             session.held.clear();
         }
         let collected = epoch.into_collected();
-        metrics::surplus(collected.surplus_steps);
         // The trainer may be ending.
         let _ = self.results.send(collected);
     }
@@ -305,11 +302,16 @@ impl Coordinator {
             leases.entry(session).or_default().push(index);
         }
         let number = epoch.number;
+        let sessions = self.sessions.len();
         for (id, episodes) in leases {
             if let Some(session) = self.sessions.get_mut(&id) {
                 session.held.extend(&episodes);
             }
             self.order(id, Order::Lease(Leases { epoch: number, episodes }));
+        }
+        if self.sessions.len() < sessions {
+            // One was dropped over this; what it held is free for the others. Ends, since each round has fewer.
+            self.lease();
         }
     }
 }

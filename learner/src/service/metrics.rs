@@ -5,6 +5,9 @@ use metrics::{counter, describe_counter, describe_gauge, gauge};
 /// Names and explains every metric of the service.
 pub(super) fn describe() {
     describe_gauge!("popgym_learner_actors", "Actors that are connected and ready");
+    describe_gauge!("popgym_learner_open_epoch", "Epoch that is being sampled");
+    describe_gauge!("popgym_learner_sampling_version", "Version of the weights that sample it");
+    describe_gauge!("popgym_learner_lag_epochs", "Open epoch minus the version that samples it");
     describe_counter!("popgym_learner_sessions_total", "Sessions that got as far as being ready");
     describe_counter!("popgym_learner_reconnects_total", "Sessions of actors that had been here before");
     describe_counter!("popgym_learner_handshakes_refused_total", "Actors that were refused");
@@ -14,7 +17,6 @@ pub(super) fn describe() {
         "popgym_learner_episodes_refused_total",
         "Episodes received and dropped, by reason: illegal (what is illegal), late, unleased, version"
     );
-    describe_counter!("popgym_learner_surplus_steps_total", "Steps of episodes beyond the end of their epoch's batch");
     describe_counter!("popgym_learner_received_bytes_total", "Bytes of the columns of episodes received");
     describe_counter!("popgym_learner_sent_bytes_total", "Bytes of weights sent");
     describe_gauge!("popgym_learner_event_queue", "Events of sessions that wait for the coordinator");
@@ -23,6 +25,12 @@ pub(super) fn describe() {
 
 pub(super) fn actors(count: usize) {
     gauge!("popgym_learner_actors").set(count as f64);
+}
+
+pub(super) fn opened(epoch: u64, version: u64) {
+    gauge!("popgym_learner_open_epoch").set(epoch as f64);
+    gauge!("popgym_learner_sampling_version").set(version as f64);
+    gauge!("popgym_learner_lag_epochs").set(epoch as f64 - version as f64);
 }
 
 pub(super) fn joined(returned: bool) {
@@ -46,10 +54,6 @@ pub(super) fn accepted() {
 
 pub(super) fn refused(reason: &'static str, episodes: usize) {
     counter!("popgym_learner_episodes_refused_total", "reason" => reason).increment(episodes as u64);
-}
-
-pub(super) fn surplus(steps: u64) {
-    counter!("popgym_learner_surplus_steps_total").increment(steps);
 }
 
 pub(super) fn received(bytes: usize) {

@@ -126,11 +126,6 @@ impl Service {
         self.shared.actors.load(Ordering::Relaxed)
     }
 
-    /// Steps of the open epoch's batch that are there: for a display, not for a decision.
-    pub fn collected_steps(&self) -> u64 {
-        self.shared.prefix_steps.load(Ordering::Relaxed)
-    }
-
     /// Opens `epoch` for sampling with `weights` (safetensors) of `version`. An epoch that was open before is void.
     ///
     /// # Errors

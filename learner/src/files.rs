@@ -8,7 +8,7 @@ use anyhow::Context as _;
 
 /// Writes a file under a temporary name beside `path` by `write`, then renames it to `path`: readers see the old file
 /// or the new one, whole. The temporary name keeps the extension.
-pub(super) fn replace(path: &Path, write: impl FnOnce(&Path) -> anyhow::Result<()>) -> anyhow::Result<()> {
+pub(crate) fn replace(path: &Path, write: impl FnOnce(&Path) -> anyhow::Result<()>) -> anyhow::Result<()> {
     let name = path.file_name().with_context(|| format!("{} names no file", path.display()))?;
     let partial = path.with_file_name(format!(".partial-{}", name.to_string_lossy()));
     let done: anyhow::Result<()> = (|| {
@@ -27,11 +27,16 @@ pub(super) fn replace(path: &Path, write: impl FnOnce(&Path) -> anyhow::Result<(
     done.with_context(|| format!("cannot write {}", path.display()))
 }
 
+/// Replaces the file at `path` by `text`, as [`replace`] does.
+pub(crate) fn write(path: &Path, text: &str) -> anyhow::Result<()> {
+    replace(path, |partial| Ok(fs::write(partial, text)?))
+}
+
 /// A file that only grows, by whole records.
 ///
 /// What cannot be written (a full disk) is kept, the file is cut back to its last whole record, and the next
 /// [`append`](Self::append) tries again: no record is torn in the middle, none is missing.
-pub(super) struct AppendFile {
+pub(crate) struct AppendFile {
     path: PathBuf,
     file: File,
     len: u64,
@@ -40,13 +45,13 @@ pub(super) struct AppendFile {
 
 impl AppendFile {
     /// Creates `path`, which must not exist.
-    pub(super) fn create(path: &Path) -> anyhow::Result<Self> {
+    pub(crate) fn create(path: &Path) -> anyhow::Result<Self> {
         let file = File::options().append(true).create_new(true).open(path);
         Self::new(path, file)
     }
 
     /// Goes on after the end of `path`, which must exist.
-    pub(super) fn open(path: &Path) -> anyhow::Result<Self> {
+    pub(crate) fn open(path: &Path) -> anyhow::Result<Self> {
         Self::new(path, File::options().append(true).open(path))
     }
 
@@ -57,7 +62,7 @@ impl AppendFile {
     }
 
     /// Appends a record, after those that an earlier call could not write.
-    pub(super) fn append(&mut self, record: &[u8]) -> anyhow::Result<()> {
+    pub(crate) fn append(&mut self, record: &[u8]) -> anyhow::Result<()> {
         self.pending.extend_from_slice(record);
         if let Err(error) = self.file.write_all(&self.pending) {
             let _ = self.file.set_len(self.len);
@@ -69,7 +74,7 @@ impl AppendFile {
     }
 
     /// Waits until all that was appended is on the disk.
-    pub(super) fn sync(&self) -> anyhow::Result<()> {
+    pub(crate) fn sync(&self) -> anyhow::Result<()> {
         self.file.sync_data().with_context(|| format!("cannot sync {}", self.path.display()))
     }
 }
