@@ -76,7 +76,12 @@ fn continue_is_what_a_requeued_job_needs() {
 #[test]
 fn continue_after_a_death_at_the_very_beginning() {
     // What a learner leaves that was killed between its first files.
-    for files in [&["lock"][..], &["lock", ".partial-run.json"], &["lock", "run.json"], &["lock", "run.json", ".partial-config.toml"]] {
+    for files in [
+        &["lock"][..],
+        &["lock", ".partial-run.json"],
+        &["lock", "run.json"],
+        &["lock", "run.json", ".partial-config.toml"],
+    ] {
         let scene = Scene::new();
         std::fs::create_dir(scene.path("run")).unwrap();
         for file in files {

@@ -12,27 +12,12 @@
 //! `weight_input [3 hidden, inputs]` and `weight_state [3 hidden, hidden]` hold the gates in the order r, q, n. State:
 //! `h [rows, hidden]`.
 
-use serde::{Deserialize, Serialize};
 use tch::nn::Path;
 use tch::{Device, Kind, Tensor};
 
-use super::{Memory, MemoryKind, Scan, State, gru_cpu};
+use super::{HiddenSize, Memory, MemoryKind, Scan, State, gru_cpu};
 use crate::init::uniform;
 use crate::packing::Packing;
-
-/// Options of [`Gru`].
-#[derive(Clone, Debug, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct Options {
-    /// Width of the state and of the output; the paper's is 256.
-    pub hidden_size: i64,
-}
-
-impl Default for Options {
-    fn default() -> Self {
-        Self { hidden_size: 256 }
-    }
-}
 
 /// One GRU layer.
 #[derive(Debug)]
@@ -47,9 +32,9 @@ pub struct Gru {
 impl MemoryKind for Gru {
     const NAME: &'static str = "gru";
     const PAPER_NAME: &'static str = "GRU";
-    type Options = Options;
+    type Options = HiddenSize;
 
-    fn new(path: &Path<'_>, input_width: i64, options: &Options) -> Result<Self, String> {
+    fn new(path: &Path<'_>, input_width: i64, options: &HiddenSize) -> Result<Self, String> {
         let hidden_size = super::check_size("hidden_size", options.hidden_size)?;
         let init = uniform(hidden_size);
         let gates = 3 * hidden_size;

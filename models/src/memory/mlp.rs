@@ -2,27 +2,12 @@
 //!
 //! `y = LeakyReLU(W2 LeakyReLU(W1 x + b1) + b2)`, `W1 [hidden, inputs]`, `W2 [hidden, hidden]`; the state is empty.
 
-use serde::{Deserialize, Serialize};
 use tch::nn::Path;
 use tch::{Device, Tensor};
 
-use super::{Memory, MemoryKind, Scan, State};
+use super::{HiddenSize, Memory, MemoryKind, Scan, State};
 use crate::init::{Linear, leaky_relu, uniform};
 use crate::packing::Packing;
-
-/// Options of [`Mlp`].
-#[derive(Clone, Debug, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct Options {
-    /// Width of both layers; the paper's is 256.
-    pub hidden_size: i64,
-}
-
-impl Default for Options {
-    fn default() -> Self {
-        Self { hidden_size: 256 }
-    }
-}
 
 /// Two layers on the present input.
 #[derive(Debug)]
@@ -35,9 +20,9 @@ pub struct Mlp {
 impl MemoryKind for Mlp {
     const NAME: &'static str = "mlp";
     const PAPER_NAME: &'static str = "MLP";
-    type Options = Options;
+    type Options = HiddenSize;
 
-    fn new(path: &Path<'_>, input_width: i64, options: &Options) -> Result<Self, String> {
+    fn new(path: &Path<'_>, input_width: i64, options: &HiddenSize) -> Result<Self, String> {
         let hidden_size = super::check_size("hidden_size", options.hidden_size)?;
         Ok(Self {
             hidden_size,

@@ -8,8 +8,8 @@
 
 use std::sync::Arc;
 
-use serde::Serialize;
 use serde::de::DeserializeOwned;
+use serde::{Deserialize, Serialize};
 use tch::nn::Path;
 use tch::{Device, Tensor};
 
@@ -87,6 +87,20 @@ pub trait Memory: Send {
 
     /// Whole sequences: packed `input [rows, input width]`; `state` before their first step, in packed order.
     fn scan(&self, input: &Tensor, packing: &Packing, state: &State) -> Scan;
+}
+
+/// The options of a memory whose only one is its width.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct HiddenSize {
+    /// Width of the state, where there is one, and of the output; the paper's is 256.
+    pub hidden_size: i64,
+}
+
+impl Default for HiddenSize {
+    fn default() -> Self {
+        Self { hidden_size: 256 }
+    }
 }
 
 /// A kind of memory that can be built by name.
