@@ -141,15 +141,20 @@ impl Checkpoint {
         })
     }
 
-    /// The newest checkpoint below `dir` that is whole; a damaged one is reported and the one before is taken.
+    /// The newest checkpoint below `dir` that is whole and that the run's metrics reach (they end after `rows` epochs); one
+    /// that is not is reported and the one before is taken. If the metrics reach none, the newest.
     ///
     /// # Errors
     /// There are checkpoints, and every one is damaged.
-    pub fn latest(dir: &Path, parameters: i64) -> anyhow::Result<Option<Self>> {
+    pub fn latest(dir: &Path, parameters: i64, rows: u64) -> anyhow::Result<Option<Self>> {
         let paths = list(dir)?;
-        let mut last_error = None;
+        let (mut beyond, mut last_error) = (None, None);
         for path in paths.into_iter().rev() {
             match Self::load(&path, parameters) {
+                Ok(checkpoint) if checkpoint.progress.epoch > rows => {
+                    tracing::warn!("checkpoint not used: {} lies beyond the last row of metrics", path.display());
+                    beyond.get_or_insert(checkpoint);
+                }
                 Ok(checkpoint) => return Ok(Some(checkpoint)),
                 Err(error) => {
                     tracing::warn!("checkpoint not used: {error:#}");
@@ -157,7 +162,10 @@ impl Checkpoint {
                 }
             }
         }
-        last_error.map_or(Ok(None), |error| Err(error.context("no checkpoint can be used")))
+        match (beyond, last_error) {
+            (None, Some(error)) => Err(error.context("no checkpoint can be used")),
+            (beyond, _) => Ok(beyond),
+        }
     }
 }
 
@@ -240,4 +248,73 @@ fn remove_dir_if_there(path: &Path) -> anyhow::Result<()> {
 
 fn hex_digest(bytes: &[u8]) -> String {
     format!("{:x}", Sha256::digest(bytes))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn checkpoint(epoch: u64, mean_return: f64) -> Checkpoint {
+        let moment = |value: f64| Tensor::full([3], value, (Kind::Float, tch::Device::Cpu));
+        Checkpoint {
+            progress: Progress {
+                epoch,
+                env_steps: 10 * epoch,
+                episodes: epoch,
+                kl_coef: 0.2,
+                mmer: Some(mean_return),
+                mean_return: Some(mean_return),
+                recent_returns: vec![0.1, -1.0 / 3.0],
+                wall_seconds: 1.5,
+            },
+            weights: Bytes::from_static(b"newest"),
+            sampling: Bytes::from_static(b"the ones before"),
+            optimizer: AdamState { first_moment: moment(1.0 / 3.0), second_moment: moment(2e-9), steps: 7 },
+        }
+    }
+
+    fn epochs(dir: &Path) -> Vec<u64> {
+        list(dir).unwrap().iter().map(|path| Checkpoint::load(path, 3).unwrap().progress.epoch).collect()
+    }
+
+    #[test]
+    fn what_is_saved_is_loaded() {
+        let dir = tempfile::tempdir().unwrap();
+        let saved = checkpoint(12, 0.25);
+        let path = saved.save(dir.path(), &BTreeMap::new()).unwrap();
+        let loaded = Checkpoint::load(&path, 3).unwrap();
+        assert_eq!(loaded.progress, saved.progress);
+        assert_eq!((loaded.weights, loaded.sampling), (saved.weights, saved.sampling));
+        assert_eq!(loaded.optimizer.steps, 7);
+        assert!(loaded.optimizer.first_moment.equal(&saved.optimizer.first_moment));
+        assert!(loaded.optimizer.second_moment.equal(&saved.optimizer.second_moment));
+        assert!(Checkpoint::load(&path, 4).is_err());
+    }
+
+    #[test]
+    fn the_newest_that_can_be_used() {
+        let dir = tempfile::tempdir().unwrap();
+        assert!(Checkpoint::latest(dir.path(), 3, 9).unwrap().is_none());
+        for epoch in [2, 4, 6] {
+            checkpoint(epoch, 0.0).save(dir.path(), &BTreeMap::new()).unwrap();
+        }
+        let latest = |rows| Checkpoint::latest(dir.path(), 3, rows).map(|found| found.unwrap().progress.epoch);
+        assert_eq!(latest(9).unwrap(), 6);
+        assert_eq!(latest(5).unwrap(), 4);
+        assert_eq!(latest(1).unwrap(), 6);
+        for (epoch, usable) in [(6, Some(4)), (4, Some(2)), (2, None)] {
+            fs::write(dir.path().join(format!("epoch-{epoch:06}")).join(WEIGHTS), "damaged").unwrap();
+            assert_eq!(latest(9).ok(), usable);
+        }
+    }
+
+    #[test]
+    fn the_last_few_and_the_best_are_kept() {
+        let dir = tempfile::tempdir().unwrap();
+        for (epoch, mean_return) in [(1, 0.1), (2, 0.9), (3, 0.3), (4, 0.2), (5, 0.4)] {
+            checkpoint(epoch, mean_return).save(dir.path(), &BTreeMap::new()).unwrap();
+        }
+        prune(dir.path(), 2).unwrap();
+        assert_eq!(epochs(dir.path()), [2, 4, 5]);
+    }
 }

@@ -24,7 +24,7 @@ const LONGEST_WAIT: Duration = Duration::from_secs(10);
 const STOP_DEADLINE: Duration = Duration::from_secs(5);
 
 /// Set when a local actor has failed this often in a row, each time soon after its start: it will never work.
-const HOPELESS_FAILURES: u32 = 6;
+const HOPELESS_FAILURES: u32 = 4;
 
 /// Whether local actors fail again and again.
 #[derive(Clone, Debug, Default)]
@@ -240,6 +240,20 @@ mod tests {
         let program = script(dir.path(), "echo up >> $1; exit 1");
         let _actors = LocalActors::spawn(1, program, vec![log.display().to_string()]).unwrap();
         wait_for("a second life", || lines(&log) >= 2);
+    }
+
+    #[test]
+    fn actors_that_fail_again_and_again_are_hopeless_and_killed_ones_are_not() {
+        let dir = tempfile::tempdir().unwrap();
+        let log = dir.path().join("log");
+        let spawn =
+            |body: &str| LocalActors::spawn(1, script(dir.path(), body), vec![log.display().to_string()]).unwrap();
+        let killed = spawn("echo up >> $1; kill -9 $$");
+        wait_for("a third life", || lines(&log) >= 3);
+        assert!(!killed.hopeless().is_set());
+        killed.stop();
+        let failing = spawn("exit 1");
+        wait_for("hopelessness", || failing.hopeless().is_set());
     }
 
     #[test]

@@ -79,7 +79,7 @@ fn configure(args: &EvalArgs, extensions: &Extensions) -> anyhow::Result<Config>
 fn choose(args: &EvalArgs, parameters: i64) -> anyhow::Result<Checkpoint> {
     let checkpoints = args.dir.join("checkpoints");
     let chosen = match args.checkpoint {
-        Which::Last => Checkpoint::latest(&checkpoints, parameters)?,
+        Which::Last => Checkpoint::latest(&checkpoints, parameters, u64::MAX)?,
         Which::Best => match checkpoint::best(&checkpoints)? {
             Some(path) => Some(Checkpoint::load(&path, parameters)?),
             None => None,

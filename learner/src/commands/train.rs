@@ -98,7 +98,8 @@ fn continue_run(path: &Path, config: &Config, extensions: &Extensions) -> Result
 /// Runs what `config` says in `dir`, from the directory's last checkpoint if it has one.
 fn carry_out(dir: &RunDir, mut session: Session<'_>, config: &Config, extensions: Extensions) -> Outcome {
     let interrupt = Interrupt::listen()?;
-    let checkpoint = Checkpoint::latest(&dir.checkpoints(), session.parameters())?;
+    let rows = MetricsCsv::read(dir.path()).map_or(0, |rows| rows.len() as u64);
+    let checkpoint = Checkpoint::latest(&dir.checkpoints(), session.parameters(), rows)?;
     if let Some(path) = complete(dir, config, checkpoint.as_ref()) {
         say(&format!("already complete: {}", path.display()))?;
         return Ok(0);
