@@ -152,10 +152,17 @@ impl Checkpoint {
         for path in paths.into_iter().rev() {
             match Self::load(&path, parameters) {
                 Ok(checkpoint) if checkpoint.progress.epoch > rows => {
-                    tracing::warn!("checkpoint not used: {} lies beyond the last row of metrics", path.display());
                     beyond.get_or_insert(checkpoint);
                 }
-                Ok(checkpoint) => return Ok(Some(checkpoint)),
+                Ok(checkpoint) => {
+                    if beyond.is_some() {
+                        tracing::warn!(
+                            "newer checkpoints than {} are not used: metrics.csv ends before",
+                            path.display()
+                        );
+                    }
+                    return Ok(Some(checkpoint));
+                }
                 Err(error) => {
                     tracing::warn!("checkpoint not used: {error:#}");
                     last_error = Some(error);
