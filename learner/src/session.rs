@@ -5,7 +5,7 @@ use std::net::TcpListener;
 use std::path::PathBuf;
 
 use anyhow::Context;
-use popgym_envs::{EnvSpec, Purpose, stream};
+use popgym_envs::{EnvSpec, Purpose, Space, stream};
 use popgym_models::{Policy, PolicySpec, memory};
 use popgym_proto::{EpisodeSpec, fingerprint};
 use rand::Rng as _;
@@ -24,6 +24,10 @@ pub struct Session<'a> {
     memories: memory::Registry,
     device: Device,
     parameters: i64,
+    /// Names and shapes of the policy's parameters.
+    signature: String,
+    /// Space of the actions that episodes store.
+    stored_action: Space,
     listener: Option<TcpListener>,
     service: Option<Service>,
     actors: Option<LocalActors>,
@@ -39,19 +43,20 @@ impl<'a> Session<'a> {
         popgym_models::device::set_threads(config.threads);
         let env = extensions.envs.get(&config.env)?.spec.clone();
         let policy_spec = config.policy_spec(&env);
-        let mut session = Self {
+        let policy = Policy::new(&policy_spec, &extensions.memories, Device::Cpu)?;
+        Ok(Self {
             config,
             env,
             policy_spec,
             memories: extensions.memories.clone(),
             device,
-            parameters: 0,
+            parameters: policy.parameters().values().map(|tensor| tensor.numel() as i64).sum(),
+            signature: policy.signature(),
+            stored_action: policy.distribution().stored_space(),
             listener: None,
             service: None,
             actors: None,
-        };
-        session.parameters = session.policy()?.parameters().values().map(|tensor| tensor.numel() as i64).sum();
-        Ok(session)
+        })
     }
 
     /// The environment's specification.
@@ -81,6 +86,9 @@ impl<'a> Session<'a> {
         let seed = stream(self.config.seed, 0, 0, Purpose::Weights).next_u64();
         tch::manual_seed((seed >> 1) as i64);
         let drawn = Policy::new(&self.policy_spec, &self.memories, Device::Cpu)?;
+        if self.device == Device::Cpu {
+            return Ok(drawn);
+        }
         let mut policy = self.policy()?;
         policy.load(&drawn.to_bytes())?;
         Ok(policy)
@@ -115,14 +123,13 @@ impl<'a> Session<'a> {
         }
         let listener = self.listener.take().context("no listening address")?;
         let address = listener.local_addr()?;
-        let policy = self.policy()?;
         let spec = self.config.run_spec(run, evaluation)?;
         let episodes = EpisodeSpec {
             observation: self.env.observation.clone(),
-            action: policy.distribution().stored_space(),
+            action: self.stored_action.clone(),
             max_steps: self.env.max_steps.min(self.config.max_episode_steps),
         };
-        let fingerprint = fingerprint(&spec, &format!("{:?}", self.env), &policy.signature());
+        let fingerprint = fingerprint(&spec, &format!("{:?}", self.env), &self.signature);
         self.service = Some(Service::start(listener, spec, episodes, fingerprint)?);
         let service = &self.config.service;
         if service.actors > 0 {

@@ -131,7 +131,7 @@ impl Trainer<'_> {
         })
     }
 
-    /// Opens the sampling of the next epoch.
+    /// Opens the sampling of the session's first epoch.
     fn open(&self, state: &State) -> anyhow::Result<()> {
         let epoch = state.progress.epoch;
         if self.config.reached(&state.progress).is_some() {
@@ -185,13 +185,9 @@ impl Trainer<'_> {
         );
         let means = match means {
             Ok(means) => means,
-            Err(UpdateError::Interrupted) => {
-                state.progress = before;
-                return Ok(false);
-            }
             Err(error) => {
                 state.progress = before;
-                return Err(error.into());
+                return if error == UpdateError::Interrupted { Ok(false) } else { Err(error.into()) };
             }
         };
         let learn_seconds = learning.elapsed().as_secs_f64();
@@ -207,12 +203,11 @@ impl Trainer<'_> {
         if !pipelined {
             // Refuses weights that are not finite, before the snapshot becomes what a checkpoint holds.
             self.behaviour.load(&sampling)?;
+            if self.config.reached(&state.progress).is_none() {
+                self.open_epoch(epoch + 1, epoch + 1, sampling.clone())?;
+            }
         }
         state.snapshot = Checkpoint { progress: state.progress.clone(), weights, sampling, optimizer };
-
-        if !pipelined {
-            self.open(state)?;
-        }
 
         // REPORT AND SAVE: the row of metrics first, so that a checkpoint never stands without it.
         let metrics = epoch_metrics(epoch, state, &collected.episodes, &means, schedule, old.explained_variance);
