@@ -52,6 +52,7 @@ fn rollout(memory: &str, env: &str, slots: u32) -> anyhow::Result<Rollout> {
     let spec = RunSpec {
         run: "bench".to_owned(),
         env: envs.canonical(env)?.to_owned(),
+        observability: popgym_envs::Observability::Partial,
         max_episode_steps: 1024,
         memory: memory.to_owned(),
         memory_options: memories.get(memory)?.resolve(&toml::Table::new())?,
@@ -98,7 +99,7 @@ impl Sampler {
                 rollout.lease(self.next_lease..self.next_lease + 1024);
                 self.next_lease += 1024;
             }
-            rollout.step(&mut self.finished);
+            rollout.step(&mut self.finished).expect("actions of the space");
             steps += rollout.live() + self.finished.len();
             self.sent_steps += self.finished.iter().map(|episode| episode.steps).sum::<usize>();
             for message in worker::messages(0, 0, &mut self.finished) {

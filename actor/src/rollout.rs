@@ -8,7 +8,7 @@
 
 use std::collections::VecDeque;
 
-use popgym_envs::{EnvSpec, EpisodeRng, Purpose, Slab, VecEnv, stream};
+use popgym_envs::{EnvSpec, EpisodeRng, Purpose, Slab, StepError, VecEnv, stream};
 use popgym_models::{Policy, PolicySpec, State, memory};
 use popgym_proto::{Episode, EpisodeBuilder, EpisodeSpec, Fingerprint, RunSpec, fingerprint, limits};
 use tch::{Device, Tensor};
@@ -75,7 +75,7 @@ impl Rollout {
         slots: u32,
     ) -> anyhow::Result<Self> {
         let slots = slots as usize;
-        let envs = VecEnv::new(envs, &spec.env, slots)?;
+        let envs = VecEnv::observing(envs, &spec.env, spec.observability, slots)?;
         let EnvSpec { observation, action, .. } = envs.spec();
         let policy_spec = PolicySpec {
             observation: observation.clone(),
@@ -199,10 +199,13 @@ impl Rollout {
     }
 
     /// One step of every live episode; the episodes that it ended are added to `finished`.
-    pub fn step(&mut self, finished: &mut Vec<Episode>) {
+    ///
+    /// # Errors
+    /// The policy chose what is no action: its weights or its arithmetic are broken.
+    pub fn step(&mut self, finished: &mut Vec<Episode>) -> Result<(), StepError> {
         self.arrange_rows();
         if self.live == 0 {
-            return;
+            return Ok(());
         }
         self.tally.lap(Activity::Env);
         self.encode();
@@ -210,8 +213,9 @@ impl Rollout {
         self.infer();
         self.tally.lap(Activity::Inference);
         self.tally.steps(self.live);
-        self.advance(finished);
+        self.advance(finished)?;
         self.tally.lap(Activity::Env);
+        Ok(())
     }
 
     /// Number of rows to compute for `live` live ones.
@@ -310,14 +314,14 @@ impl Rollout {
     }
 
     /// Draws the actions, steps the environments, stores what happened, and retires rows whose episode has ended.
-    fn advance(&mut self, finished: &mut Vec<Episode>) {
+    fn advance(&mut self, finished: &mut Vec<Episode>) -> Result<(), StepError> {
         let distribution = self.policy.distribution();
         for (row, params) in self.rows.iter_mut().zip(self.params.chunks_exact(distribution.width())) {
             let Some(slot) = *row else { continue };
             let Slot { actions, episode } = &mut self.slots[slot];
             let log_prob = distribution.sample(params, actions, self.stored_actions.row_mut(slot));
             distribution.to_env(self.stored_actions.row(slot), self.env_actions.row_mut(slot));
-            let step = self.envs.step(slot, self.env_actions.row(slot), &mut self.observations);
+            let step = self.envs.step(slot, self.env_actions.row(slot), &mut self.observations)?;
             episode.push(self.stored_actions.row(slot), log_prob, step.reward, self.observations.row(slot));
             let out_of_time = episode.steps() >= self.spec.max_episode_steps as usize;
             if step.done() || out_of_time {
@@ -327,5 +331,6 @@ impl Rollout {
                 self.live -= 1;
             }
         }
+        Ok(())
     }
 }

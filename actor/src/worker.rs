@@ -176,7 +176,12 @@ impl State {
             }
             return false;
         };
-        rollout.step(&mut self.finished);
+        if let Err(error) = rollout.step(&mut self.finished) {
+            rollout.drop_episodes();
+            self.finished.clear();
+            self.send(Output::Failed(error.to_string()));
+            return true;
+        }
         if !self.finished.is_empty() {
             self.send_finished();
         }

@@ -11,6 +11,7 @@ fn spec(env: &str, memory: &str) -> RunSpec {
     RunSpec {
         run: "test".to_owned(),
         env: popgym_envs::Registry::standard().canonical(env).unwrap().to_owned(),
+        observability: popgym_envs::Observability::Partial,
         max_episode_steps: 1024,
         memory: memory.to_owned(),
         memory_options: memories.get(memory).unwrap().resolve(&toml::Table::new()).unwrap(),
@@ -44,7 +45,7 @@ fn play(rollout: &mut Rollout, indices: &[u64], chunk: usize) -> BTreeMap<u64, E
         if rollout.is_idle() {
             break;
         }
-        rollout.step(&mut finished);
+        rollout.step(&mut finished).unwrap();
         steps += 1;
         assert!(steps < 100_000, "episodes end");
     }
@@ -106,7 +107,7 @@ fn an_epoch_that_is_over_leaves_nothing_behind() {
     let spec = spec("RepeatPreviousEasy", "gru");
     let mut rollout = rollout(spec, 8, None);
     rollout.lease(0..20);
-    rollout.step(&mut Vec::new());
+    rollout.step(&mut Vec::new()).unwrap();
     assert_eq!((rollout.live(), rollout.waiting()), (8, 12));
     rollout.open(4, 2, None).unwrap();
     assert!(rollout.is_idle());

@@ -17,8 +17,10 @@
 
 use serde::{Deserialize, Serialize};
 
+use crate::board::draw_board;
+use crate::canvas::{Canvas, Colour, Style, View};
 use crate::draws::Draws;
-use crate::env::{Env, EnvSpec, Step, parse_world};
+use crate::env::{Env, EnvSpec, Step, parse_world, world_value};
 use crate::rng::{EpisodeRng, below};
 use crate::space::{Space, Value, ValueMut};
 
@@ -41,9 +43,13 @@ pub const SHIP_CELLS: u32 = 12;
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct World {
-    /// `[n][n]`, row by row: 1 is a ship, 0 is water.
+    /// `[n][n]`, row by row: 1 is a ship, 0 is water. A given world may have its twelve ship cells anywhere.
     pub ships: Vec<Vec<u8>>,
 }
+
+/// The bits of a cell.
+const SHIP: u8 = 1;
+const SHOT: u8 = 2;
 
 /// The game.
 #[derive(Clone, Debug)]
@@ -52,13 +58,13 @@ pub struct Battleship {
     board: usize,
     /// Rewards of a miss and of a hit.
     rewards: [f64; 2],
-    /// `[n * n]`, 0 or 1.
-    ships: Vec<u8>,
-    /// `[n * n]`, 0 or 1.
-    shot: Vec<u8>,
-    hits: u32,
+    /// `[n * n]`, each with its bits.
+    cells: Vec<u8>,
     steps: u32,
+    hits: u8,
     observed: u8,
+    /// The last shot's cell, if there was one.
+    last: Option<u16>,
 }
 
 impl Battleship {
@@ -68,46 +74,41 @@ impl Battleship {
     /// If the board is not from 5 to 256 cells wide (on a smaller one the ships might not fit).
     pub fn new(id: &str, Params { board }: Params) -> Self {
         assert!((5..=256).contains(&board), "the board is {board} wide, allowed is 5..=256");
-        let cells = board * board;
-        let water = (cells as u32 - SHIP_CELLS) as f64;
+        let count = board * board;
+        let water = (count as u32 - SHIP_CELLS) as f64;
         let spec = EnvSpec {
             id: id.to_owned(),
             observation: Space::Discrete(2),
             action: Space::MultiDiscrete(vec![board as u16; 2]),
             state: Space::Tuple(vec![
-                Space::MultiDiscrete(vec![2; cells]),
-                Space::MultiDiscrete(vec![2; cells]),
+                Space::MultiDiscrete(vec![2; count]),
+                Space::MultiDiscrete(vec![2; count]),
                 Space::Discrete(2),
             ]),
-            max_steps: cells as u32,
-            return_range: (-(cells as f64) / water, 1.0),
+            max_steps: count as u32,
+            return_range: (-(count as f64) / water, 1.0),
         };
         // Any 12 cells will do until the first world is drawn or set.
-        let ships = (0..cells as u32).map(|cell| u8::from(cell < SHIP_CELLS)).collect();
+        let cells = (0..count as u32).map(|cell| u8::from(cell < SHIP_CELLS)).collect();
         let rewards = [-1.0 / water, 1.0 / f64::from(SHIP_CELLS)];
-        Self { spec, board, rewards, ships, shot: vec![0; cells], hits: 0, steps: 0, observed: 0 }
+        Self { spec, board, rewards, cells, steps: 0, hits: 0, observed: 0, last: None }
     }
 
-    /// Tries to place a ship of `length` cells from a random cell in a random direction.
+    /// Tries to place a ship of `length` cells.
+    ///
+    /// The package draws a cell and a direction until the ship is on the board. Each place on the board is then the
+    /// outcome of two of these draws (one from either end), so all are equally likely: here one of them is drawn.
     fn try_place(&mut self, length: usize, rng: &mut EpisodeRng) -> bool {
-        // One draw for row, column and one of four directions.
-        let drawn = below(rng, 4 * (self.board * self.board) as u32) as usize;
-        let (start, direction) = (drawn / 4, drawn % 4);
-        let (row, column) = (start / self.board, start % self.board);
-        let (place, stride) = if direction < 2 { (row, self.board) } else { (column, 1) };
-        let reach = length - 1;
-        let first = if direction % 2 == 0 && place + reach < self.board {
-            start
-        } else if direction % 2 == 1 && place >= reach {
-            start - reach * stride
-        } else {
-            return false;
-        };
-        if (0..length).any(|i| self.ships[first + i * stride] == 1) {
-            return false;
+        let n = self.board;
+        let line = below(rng, 2 * n as u32) as usize;
+        let offset = below(rng, (n - length + 1) as u32) as usize;
+        let (first, stride) = if line < n { (line * n + offset, 1) } else { (offset * n + line - n, n) };
+        let place = || (0..length).map(|i| first + i * stride);
+        let free = place().all(|cell| self.cells[cell] == 0);
+        if free {
+            place().for_each(|cell| self.cells[cell] = SHIP);
         }
-        (0..length).for_each(|i| self.ships[first + i * stride] = 1);
-        true
+        free
     }
 }
 
@@ -117,7 +118,7 @@ impl Env for Battleship {
     }
 
     fn draw_world(&mut self, rng: &mut EpisodeRng) {
-        self.ships.fill(0);
+        self.cells.fill(0);
         for length in SHIPS {
             while !self.try_place(length, rng) {}
         }
@@ -137,35 +138,61 @@ impl Env for Battleship {
         if count != SHIP_CELLS {
             return Err(format!("the ships cover {count} cells, expected {SHIP_CELLS}"));
         }
-        self.ships = cells;
+        self.cells = cells;
         Ok(())
     }
 
+    fn world(&self) -> serde_json::Value {
+        let row = |row: &[u8]| row.iter().map(|cell| cell & SHIP).collect();
+        world_value(&World { ships: self.cells.chunks(self.board).map(row).collect() })
+    }
+
     fn begin(&mut self, _draws: &mut dyn Draws, observation: ValueMut<'_>) {
-        self.shot.fill(0);
-        (self.hits, self.steps, self.observed) = (0, 0, 0);
+        self.cells.iter_mut().for_each(|cell| *cell &= SHIP);
+        (self.steps, self.hits, self.observed, self.last) = (0, 0, 0, None);
         observation.discrete[0] = 0;
     }
 
+    #[inline]
     fn step(&mut self, action: Value<'_>, _draws: &mut dyn Draws, observation: ValueMut<'_>) -> Step {
-        let cell = usize::from(action.discrete[0]) * self.board + usize::from(action.discrete[1]);
-        let hit = self.ships[cell] & (1 - self.shot[cell]);
-        self.shot[cell] = 1;
-        self.hits += u32::from(hit);
+        let shot = usize::from(action.discrete[0]) * self.board + usize::from(action.discrete[1]);
+        let cell = &mut self.cells[shot];
+        let hit = *cell == SHIP;
+        *cell |= SHOT;
+        self.hits += u8::from(hit);
         self.steps += 1;
-        self.observed = hit;
-        observation.discrete[0] = hit;
+        (self.observed, self.last) = (u8::from(hit), Some(shot as u16));
+        observation.discrete[0] = self.observed;
         Step {
             reward: self.rewards[usize::from(hit)],
-            terminated: self.hits == SHIP_CELLS,
+            terminated: u32::from(self.hits) == SHIP_CELLS,
             truncated: self.steps >= self.spec.max_steps,
         }
     }
 
     fn state(&self, state: ValueMut<'_>) {
-        let cells = self.ships.len();
-        state.discrete[..cells].copy_from_slice(&self.ships);
-        state.discrete[cells..2 * cells].copy_from_slice(&self.shot);
-        state.discrete[2 * cells] = self.observed;
+        let (ships, rest) = state.discrete.split_at_mut(self.cells.len());
+        let (shots, observed) = rest.split_at_mut(self.cells.len());
+        for ((ship, shot), cell) in ships.iter_mut().zip(shots).zip(&self.cells) {
+            (*ship, *shot) = (cell & SHIP, cell >> 1);
+        }
+        observed[0] = self.observed;
+    }
+
+    fn render(&self, view: View, canvas: &mut Canvas) {
+        let hit = ('×', Style::ink(Colour::Red).bold());
+        let miss = ('○', Style::ink(Colour::Cyan));
+        let water = ('·', Style::ink(Colour::Blue));
+        draw_board(canvas, self.board, |cell| {
+            let last = self.last == Some(cell as u16);
+            let (symbol, style) = match (view, self.cells[cell]) {
+                (View::Observed, _) if last => [miss, hit][usize::from(self.observed)],
+                (View::Observed, _) | (View::Revealed, 0) => water,
+                (View::Revealed, SHIP) => ('█', Style::ink(Colour::White)),
+                (View::Revealed, SHOT) => miss,
+                (View::Revealed, _) => hit,
+            };
+            (symbol, if last { style.on(Colour::Grey) } else { style })
+        });
     }
 }

@@ -1,5 +1,6 @@
-//! POPGym's partially observable environments (Morad et al., "POPGym: Benchmarking Partially Observable Reinforcement
-//! Learning", ICLR 2023): exact, fast, and free of everything but numbers.
+#![doc = include_str!("../README.md")]
+//!
+//! # Modules
 //!
 //! | module | what it holds |
 //! |---|---|
@@ -9,52 +10,59 @@
 //! | [`draws`] | per-step randomness, from a stream or a recording |
 //! | [`registry`] | environments by name; the place to add one's own |
 //! | [`vec_env`] | many environments, stepped into storage that the caller owns |
+//! | [`observability`], [`wrappers`] | other observations and actions around an environment |
+//! | [`canvas`] | pictures of environments |
+//! | [`random_policy`] | what acting at random returns |
 //! | [`deck`] | the cards of the card games |
-//! | [`repeat_first`], [`repeat_previous`] | diagnostic games |
-//! | [`cart_pole`], [`pendulum`] | control with hidden velocities |
-//! | [`battleship`] | board game |
+//! | [`repeat_first`], [`repeat_previous`], [`autoencode`], [`count_recall`] | diagnostic games, with cards |
+//! | [`cart_pole`], [`pendulum`], [`velocity_only_cart_pole`] | control with hidden velocities, or hidden positions |
+//! | [`noisy_cart_pole`], [`noisy_pendulum`], [`multiarmed_bandit`] | noisy tasks |
+//! | [`battleship`], [`concentration`], [`higher_lower`], [`mine_sweeper`] | games |
+//! | [`labyrinth_escape`], [`labyrinth_explore`], [`maze`] | navigation, and its mazes |
 //!
 //! One file is one game, with its difficulties as a table at the top. Rules, rewards and quirks are those of the Python
 //! package, version 1.0.7, replayed step by step in the tests.
-//!
-//! ```
-//! use popgym_envs::{Purpose, Registry, VecEnv, stream};
-//!
-//! let registry = Registry::standard();
-//! let mut envs = VecEnv::new(&registry, "RepeatPreviousEasy", 1)?;
-//! let (mut observations, mut actions) = (envs.observations(), envs.actions());
-//! let mut policy = stream(0, 0, 0, Purpose::TrainAction);
-//! envs.begin(0, stream(0, 0, 0, Purpose::TrainEnv), &mut observations);
-//! let mut episode_return = 0.0;
-//! loop {
-//!     envs.spec().action.sample_into(&mut policy, actions.row_mut(0));
-//!     let step = envs.step(0, actions.row(0), &mut observations);
-//!     episode_return += step.reward;
-//!     if step.done() {
-//!         break;
-//!     }
-//! }
-//! assert!((-1.0..=1.0).contains(&episode_return));
-//! # Ok::<(), popgym_envs::UnknownEnv>(())
-//! ```
 #![forbid(unsafe_code)]
 
+pub mod autoencode;
 pub mod battleship;
+mod board;
+pub mod canvas;
 pub mod cart_pole;
+pub mod concentration;
+pub mod count_recall;
 pub mod deck;
 pub mod draws;
 pub mod env;
+pub mod higher_lower;
+pub mod labyrinth_escape;
+pub mod labyrinth_explore;
+pub mod maze;
+pub mod mine_sweeper;
+pub mod multiarmed_bandit;
+pub mod noisy_cart_pole;
+pub mod noisy_pendulum;
+pub mod observability;
 pub mod pendulum;
+mod pictures;
+pub mod random_policy;
 pub mod registry;
 pub mod repeat_first;
 pub mod repeat_previous;
 pub mod rng;
+mod sketch;
 pub mod space;
+mod standard;
 pub mod vec_env;
+pub mod velocity_only_cart_pole;
+pub mod wrappers;
 
+pub use canvas::{Canvas, Colour, Glyph, Style, View};
 pub use draws::{Draws, Recorded};
-pub use env::{Difficulty, Env, EnvSpec, Step, parse_world};
-pub use registry::{Entry, RegisterError, Registry, UnknownEnv};
+pub use env::{Difficulty, Env, EnvSpec, Step, parse_world, world_value};
+pub use observability::{Observability, Observed};
+pub use registry::{Entry, MakeError, RegisterError, Registry, UnknownEnv};
 pub use rng::{EpisodeRng, Purpose, stream};
 pub use space::{Leaf, Slab, Space, SpaceError, Value, ValueMut};
-pub use vec_env::VecEnv;
+pub use vec_env::{StepError, VecEnv};
+pub use wrappers::{Antialias, DiscreteAction, Flatten, PreviousAction};

@@ -7,9 +7,29 @@
 use std::sync::Arc;
 
 use crate::env::{Difficulty, Env, EnvSpec};
-use crate::{battleship, cart_pole, pendulum, repeat_first, repeat_previous};
+use crate::observability::{Observability, Observed};
+use crate::vec_env::{Rows, Typed};
 
-type Make = dyn Fn() -> Box<dyn Env> + Send + Sync;
+/// Makes environments of one type.
+trait Make: Send + Sync {
+    fn env(&self) -> Box<dyn Env>;
+    fn rows(&self, observability: Observability, rows: usize) -> Result<Box<dyn Rows>, String>;
+}
+
+impl<E: Env + 'static, F: Fn() -> E + Send + Sync> Make for F {
+    fn env(&self) -> Box<dyn Env> {
+        Box::new(self())
+    }
+
+    fn rows(&self, observability: Observability, rows: usize) -> Result<Box<dyn Rows>, String> {
+        let envs = (0..rows).map(|_| self());
+        if matches!(observability, Observability::Partial | Observability::FullInInfo) {
+            return Ok(Box::new(Typed::new(envs)));
+        }
+        let envs: Vec<_> = envs.map(|env| Observed::new(env, observability)).collect::<Result<_, _>>()?;
+        Ok(Box::new(Typed::new(envs.into_iter())))
+    }
+}
 
 /// One environment of a [`Registry`].
 #[derive(Clone)]
@@ -18,13 +38,15 @@ pub struct Entry {
     pub name: String,
     /// Further names, for example the paper's `StatelessCartPoleEasy`.
     pub aliases: Vec<String>,
+    /// The name in the paper's tables, if it is there.
+    pub paper_name: Option<String>,
     /// What kind of task it is, for example `diagnostic`, `control` or `game`.
     pub group: String,
     /// The size of the game, if its name ends in one.
     pub difficulty: Option<Difficulty>,
     /// Id, spaces and limits.
     pub spec: EnvSpec,
-    make: Arc<Make>,
+    make: Arc<dyn Make>,
 }
 
 impl Entry {
@@ -35,7 +57,26 @@ impl Entry {
 
     /// A new environment.
     pub fn make(&self) -> Box<dyn Env> {
-        (self.make)()
+        self.make.env()
+    }
+
+    /// The spec at a level of observability.
+    ///
+    /// # Errors
+    /// If there is no hidden state to show.
+    pub fn observed(&self, observability: Observability) -> Result<EnvSpec, MakeError> {
+        let spec = observability.apply(&self.spec);
+        spec.validate().map_err(|reason| self.nothing_to_show(observability, reason))?;
+        Ok(spec)
+    }
+
+    /// The rows of a [`crate::VecEnv`].
+    pub(crate) fn make_rows(&self, observability: Observability, rows: usize) -> Result<Box<dyn Rows>, MakeError> {
+        self.make.rows(observability, rows).map_err(|reason| self.nothing_to_show(observability, reason))
+    }
+
+    fn nothing_to_show(&self, observability: Observability, reason: String) -> MakeError {
+        MakeError::Observability { id: self.id().to_owned(), observability, reason }
     }
 
     /// Id, short name and aliases.
@@ -69,6 +110,24 @@ impl std::fmt::Display for UnknownEnv {
         }
         f.write_str("`learner list envs` lists them all")
     }
+}
+
+/// Why an environment cannot be made.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+pub enum MakeError {
+    /// There is none of this name.
+    #[error(transparent)]
+    Unknown(#[from] UnknownEnv),
+    /// It has no hidden state.
+    #[error("{id} cannot be observed at the level {observability}: {reason}")]
+    Observability {
+        /// The environment.
+        id: String,
+        /// The level asked for.
+        observability: Observability,
+        /// What is wrong with it.
+        reason: String,
+    },
 }
 
 /// Why an environment cannot be registered.
@@ -107,32 +166,10 @@ impl Registry {
         Self::default()
     }
 
-    /// The environments of this crate, game by game, each from easy to hard.
-    pub fn standard() -> Self {
-        let mut r = Self::new();
-        r.levels("RepeatFirst", None, "diagnostic", repeat_first::LEVELS, repeat_first::RepeatFirst::new);
-        r.levels("RepeatPrevious", None, "diagnostic", repeat_previous::LEVELS, repeat_previous::RepeatPrevious::new);
-        let paper = Some("StatelessCartPole");
-        r.levels("PositionOnlyCartPole", paper, "control", cart_pole::LEVELS, cart_pole::PositionOnlyCartPole::new);
-        let paper = Some("StatelessPendulum");
-        r.levels("PositionOnlyPendulum", paper, "control", pendulum::LEVELS, pendulum::PositionOnlyPendulum::new);
-        r.levels("Battleship", None, "game", battleship::LEVELS, battleship::Battleship::new);
-        r
-    }
-
-    /// Registers the three difficulties of one of this crate's games.
-    fn levels<P, E>(&mut self, class: &str, alias: Option<&str>, group: &str, levels: [P; 3], new: fn(&str, P) -> E)
-    where
-        P: Copy + Send + Sync + 'static,
-        E: Env + 'static,
-    {
-        for (difficulty, level) in Difficulty::ALL.into_iter().zip(levels) {
-            let name = format!("{class}{difficulty}");
-            let id = format!("popgym-{name}-v0");
-            let alias = alias.map(|alias| format!("{alias}{difficulty}"));
-            let aliases: Vec<&str> = alias.iter().map(String::as_str).collect();
-            self.register(&name, &aliases, group, move || Box::new(new(&id, level)))
-                .expect("this crate's own names differ and its specs are valid, which its tests check");
+    /// Sets the name in the paper of what was registered last.
+    pub(crate) fn set_paper_name(&mut self, paper_name: Option<String>) {
+        if let Some(entry) = self.entries.last_mut() {
+            entry.paper_name = paper_name;
         }
     }
 
@@ -141,25 +178,26 @@ impl Registry {
     /// # Errors
     /// If one of the names, or the id that the environment itself gives, is taken or cannot be a name, or if the
     /// environment's spec is not valid. The registry is then as before.
-    pub fn register(
+    pub fn register<E: Env + 'static>(
         &mut self,
         name: &str,
         aliases: &[&str],
         group: &str,
-        make: impl Fn() -> Box<dyn Env> + Send + Sync + 'static,
+        make: impl Fn() -> E + Send + Sync + 'static,
     ) -> Result<(), RegisterError> {
         let spec = make().spec().clone();
         spec.validate().map_err(|reason| RegisterError::Spec { name: name.to_owned(), reason })?;
         let entry = Entry {
             name: name.to_owned(),
             aliases: aliases.iter().map(|&alias| alias.to_owned()).collect(),
+            paper_name: None,
             group: group.to_owned(),
             difficulty: Difficulty::ALL.into_iter().find(|difficulty| name.ends_with(&difficulty.to_string())),
             spec,
             make: Arc::new(make),
         };
         for name in entry.names() {
-            if name.is_empty() || name.contains(char::is_whitespace) {
+            if unwrapped(name).is_empty() || name.contains(char::is_whitespace) {
                 return Err(RegisterError::Name(name.to_owned()));
             }
             if let Ok(owner) = self.get(name) {

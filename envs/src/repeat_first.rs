@@ -16,11 +16,13 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::deck::{CARDS, Deck, SUITS, suit};
+use crate::canvas::{Canvas, View};
+use crate::deck::{CARDS, Deck, Field, SUIT_NAMES, SUITS, count};
 use crate::draws::Draws;
-use crate::env::{Env, EnvSpec, Step, parse_world};
+use crate::env::{Env, EnvSpec, Step, parse_world, step_all_classes, world_value};
+use crate::pictures::{self, Choices};
 use crate::rng::EpisodeRng;
-use crate::space::{Space, Value, ValueMut};
+use crate::space::{Slab, Space, Value, ValueMut};
 
 /// The size of a game.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -43,10 +45,12 @@ pub struct World {
 /// The game.
 #[derive(Clone, Debug)]
 pub struct RepeatFirst {
-    spec: EnvSpec,
     deck: Deck,
+    first: u8,
+    last_action: Option<u8>,
     /// Of a wrong and of a right answer: looked up, because which it is cannot be predicted.
     rewards: [f64; 2],
+    spec: EnvSpec,
 }
 
 impl RepeatFirst {
@@ -55,6 +59,7 @@ impl RepeatFirst {
     /// # Panics
     /// If `decks` is out of the bounds of [`Deck::new`].
     pub fn new(id: &str, Params { decks }: Params) -> Self {
+        let deck = Deck::new(decks);
         let steps = decks * CARDS - 1;
         let spec = EnvSpec {
             id: id.to_owned(),
@@ -65,11 +70,7 @@ impl RepeatFirst {
             return_range: (-1.0, 1.0),
         };
         let unit = 1.0 / steps as f64;
-        Self { spec, deck: Deck::new(decks), rewards: [-unit, unit] }
-    }
-
-    fn first(&self) -> u8 {
-        suit(self.deck.dealt_at(0))
+        Self { spec, deck, first: 0, last_action: None, rewards: [-unit, unit] }
     }
 }
 
@@ -86,19 +87,55 @@ impl Env for RepeatFirst {
         self.deck.set(&parse_world::<World>(world)?.deck)
     }
 
-    fn begin(&mut self, _draws: &mut dyn Draws, observation: ValueMut<'_>) {
-        self.deck.restart();
-        observation.discrete[0] = suit(self.deck.deal());
+    fn world(&self) -> serde_json::Value {
+        world_value(&World { deck: self.deck.cards().to_vec() })
     }
 
+    fn begin(&mut self, _draws: &mut dyn Draws, observation: ValueMut<'_>) {
+        self.deck.restart();
+        self.first = self.deck.deal_class();
+        self.last_action = None;
+        observation.discrete[0] = self.first;
+    }
+
+    #[inline]
     fn step(&mut self, action: Value<'_>, _draws: &mut dyn Draws, observation: ValueMut<'_>) -> Step {
-        let reward = self.rewards[usize::from(action.discrete[0] == self.first())];
-        observation.discrete[0] = suit(self.deck.deal());
+        let action = action.discrete[0];
+        self.last_action = Some(action);
+        observation.discrete[0] = self.deck.deal_class();
+        let reward = self.rewards[usize::from(action == self.first)];
         Step { reward, terminated: self.deck.left() == 0, truncated: false }
     }
 
+    fn step_all(
+        envs: &mut [Self],
+        rngs: &mut [EpisodeRng],
+        actions: &Slab,
+        observations: &mut Slab,
+        steps: &mut [Step],
+    ) {
+        step_all_classes::<Self, 1>(envs, rngs, actions, observations, steps);
+    }
+
     fn state(&self, state: ValueMut<'_>) {
-        state.discrete[0] = self.first();
-        self.deck.write_suits_left(state.real);
+        state.discrete[0] = self.first;
+        self.deck.write_fractions_left(state.real);
+    }
+
+    fn render(&self, view: View, canvas: &mut Canvas) {
+        let shown = self.deck.class_back(0);
+        let right = shown.filter(|_| view == View::Revealed && self.deck.left() > 0).map(|_| self.first);
+        pictures::card(canvas, 0, 0, Field::Suit, shown);
+        Choices { last: self.last_action, right }.suits(canvas, 3, "the first suit?");
+        if view == View::Revealed {
+            let left = &self.deck.classes()[..self.deck.left()];
+            pictures::answer(canvas, 5, Field::Suit, right, "none");
+            let row = pictures::counts(canvas, 6, Field::Suit, &[("left", &|suit| count(left, suit))]);
+            pictures::to_come(canvas, row, Field::Suit, left);
+        }
+    }
+
+    fn action_names(&self) -> &'static [&'static str] {
+        &SUIT_NAMES
     }
 }

@@ -16,11 +16,13 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::deck::{CARDS, Deck, SUITS, suit};
+use crate::canvas::{Canvas, View};
+use crate::deck::{CARDS, Deck, Field, SUIT_NAMES, SUITS, count};
 use crate::draws::Draws;
-use crate::env::{Env, EnvSpec, Step, parse_world};
+use crate::env::{Env, EnvSpec, Step, parse_world, step_all_classes, world_value};
+use crate::pictures::{self, Choices};
 use crate::rng::EpisodeRng;
-use crate::space::{Space, Value, ValueMut};
+use crate::space::{Slab, Space, Value, ValueMut};
 
 /// The size of a game.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -45,11 +47,12 @@ pub struct World {
 /// The game.
 #[derive(Clone, Debug)]
 pub struct RepeatPrevious {
-    spec: EnvSpec,
     deck: Deck,
     k: usize,
+    last_action: Option<u8>,
     /// Of a wrong and of a right answer: looked up, because which it is cannot be predicted.
     rewards: [f64; 2],
+    spec: EnvSpec,
 }
 
 impl RepeatPrevious {
@@ -58,6 +61,7 @@ impl RepeatPrevious {
     /// # Panics
     /// If `decks` is out of the bounds of [`Deck::new`], or `k` is not in `1..52 * decks`.
     pub fn new(id: &str, Params { decks, k }: Params) -> Self {
+        let deck = Deck::new(decks);
         let n = decks * CARDS;
         assert!((1..n).contains(&k), "k is {k}, allowed is 1..{n}");
         let spec = EnvSpec {
@@ -69,7 +73,15 @@ impl RepeatPrevious {
             return_range: (-1.0, 1.0),
         };
         let unit = 1.0 / (n - k) as f64;
-        Self { spec, deck: Deck::new(decks), k, rewards: [-unit, unit] }
+        Self { spec, deck, k, last_action: None, rewards: [-unit, unit] }
+    }
+}
+
+impl RepeatPrevious {
+    /// The suit to name, once `k` cards were shown.
+    #[inline]
+    fn target(&self) -> Option<u8> {
+        self.deck.class_back(self.k - 1)
     }
 }
 
@@ -86,26 +98,67 @@ impl Env for RepeatPrevious {
         self.deck.set(&parse_world::<World>(world)?.deck)
     }
 
-    fn begin(&mut self, _draws: &mut dyn Draws, observation: ValueMut<'_>) {
-        self.deck.restart();
-        observation.discrete[0] = suit(self.deck.deal());
+    fn world(&self) -> serde_json::Value {
+        world_value(&World { deck: self.deck.cards().to_vec() })
     }
 
+    fn begin(&mut self, _draws: &mut dyn Draws, observation: ValueMut<'_>) {
+        self.deck.restart();
+        self.last_action = None;
+        observation.discrete[0] = self.deck.deal_class();
+    }
+
+    #[inline]
     fn step(&mut self, action: Value<'_>, _draws: &mut dyn Draws, observation: ValueMut<'_>) -> Step {
-        let reward = match self.deck.dealt().checked_sub(self.k) {
+        let action = action.discrete[0];
+        self.last_action = Some(action);
+        let reward = match self.target() {
             None => 0.0,
-            Some(target) => self.rewards[usize::from(action.discrete[0] == suit(self.deck.dealt_at(target)))],
+            Some(suit) => self.rewards[usize::from(action == suit)],
         };
-        observation.discrete[0] = suit(self.deck.deal());
+        observation.discrete[0] = self.deck.deal_class();
         Step { reward, terminated: self.deck.left() == 0, truncated: false }
     }
 
+    fn step_all(
+        envs: &mut [Self],
+        rngs: &mut [EpisodeRng],
+        actions: &Slab,
+        observations: &mut Slab,
+        steps: &mut [Step],
+    ) {
+        step_all_classes::<Self, 1>(envs, rngs, actions, observations, steps);
+    }
+
     fn state(&self, state: ValueMut<'_>) {
-        let shown = self.deck.dealt();
-        for (i, out) in state.discrete.iter_mut().enumerate() {
-            // Place i holds the card shown k - i deals ago, counting the card on show as 1 ago.
-            *out = (shown + i).checked_sub(self.k).map_or(0, |index| suit(self.deck.dealt_at(index)));
+        // Oldest first: the last place holds the card on show.
+        for (back, out) in state.discrete.iter_mut().rev().enumerate() {
+            *out = self.deck.class_back(back).unwrap_or(0);
         }
-        self.deck.write_suits_left(state.real);
+        self.deck.write_fractions_left(state.real);
+    }
+
+    fn render(&self, view: View, canvas: &mut Canvas) {
+        let ended = self.deck.left() == 0;
+        let right = self.target().filter(|_| view == View::Revealed && !ended);
+        pictures::card(canvas, 0, 0, Field::Suit, self.deck.class_back(0));
+        let question = match self.k {
+            1 => "the suit on show?".to_owned(),
+            2 => "the suit before this one?".to_owned(),
+            k => format!("the suit {} cards ago?", k - 1),
+        };
+        Choices { last: self.last_action, right }.suits(canvas, 3, &question);
+        if view == View::Revealed {
+            let left = &self.deck.classes()[..self.deck.left()];
+            pictures::answer(canvas, 5, Field::Suit, right, if ended { "none" } else { "any" });
+            let recent = (0..self.k).rev().map(|back| self.deck.class_back(back));
+            let row = pictures::cards(canvas, 6, &format!("last {}:", self.k), Field::Suit, usize::MAX, recent);
+            let row = pictures::counts(canvas, row, Field::Suit, &[("left", &|suit| count(left, suit))]);
+            pictures::to_come(canvas, row, Field::Suit, left);
+        }
+    }
+
+    fn action_names(&self) -> &'static [&'static str] {
+        &SUIT_NAMES
     }
 }

@@ -40,6 +40,7 @@ pub fn stream(run_seed: u64, epoch: u64, index: u64, purpose: Purpose) -> Episod
 ///
 /// # Panics
 /// If `n` is 0.
+#[inline]
 pub fn below(rng: &mut EpisodeRng, n: u32) -> u32 {
     let mut product = u64::from(rng.next_u32()) * u64::from(n);
     if (product as u32) < n {
@@ -52,6 +53,7 @@ pub fn below(rng: &mut EpisodeRng, n: u32) -> u32 {
 }
 
 /// Uniform in `[low, high)`.
+#[inline]
 pub fn uniform(rng: &mut EpisodeRng, low: f64, high: f64) -> f64 {
     low + (high - low) * rng.random::<f64>()
 }

@@ -84,6 +84,9 @@ impl Env for Custom {
     fn set_world(&mut self, _world: &serde_json::Value) -> Result<(), String> {
         Ok(())
     }
+    fn world(&self) -> serde_json::Value {
+        serde_json::Value::Null
+    }
     fn begin(&mut self, _draws: &mut dyn Draws, _observation: ValueMut<'_>) {}
     fn step(&mut self, _action: Value<'_>, _draws: &mut dyn Draws, _observation: ValueMut<'_>) -> Step {
         Step { reward: 0.5, terminated: true, truncated: false }
@@ -146,7 +149,7 @@ fn duplicates_and_bad_specs_are_errors_and_leave_the_registry_alone() {
         let error = register(&mut registry, name, aliases, custom(id)).unwrap_err();
         assert!(matches!(&error, RegisterError::Duplicate { name, .. } if name == taken), "{error}");
     }
-    for name in ["", "my game"] {
+    for name in ["", "popgym-", "my game"] {
         assert_eq!(register(&mut registry, name, &[], custom("new")), Err(RegisterError::Name(name.to_owned())));
     }
     let spec = || custom("new");

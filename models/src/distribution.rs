@@ -37,6 +37,17 @@ pub struct Evaluation {
     pub kl: Tensor,
 }
 
+/// The distribution of each component of an action. Components are independent, so this is all there is to know of a row.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Marginals {
+    /// Of each discrete component: the probabilities of its classes.
+    pub classes: Vec<Vec<f64>>,
+    /// Of each real component: mean and standard deviation, in the environment's units and before clipping.
+    pub reals: Vec<(f64, f64)>,
+    /// Entropy of the action, nats: real components count as they are stored, like [`Evaluation::entropy`].
+    pub entropy: f64,
+}
+
 impl ActionDistribution {
     /// The distribution over `action`, with log standard deviations kept within `log_std_bounds`.
     ///
@@ -81,12 +92,48 @@ impl ActionDistribution {
         let (means, log_stds) = params[at..].split_at(self.bounds.len());
         for ((&mean, &log_std), out) in means.iter().zip(log_stds).zip(action.real) {
             let (mean, std) = (f64::from(mean), f64::from(log_std).exp());
-            *out = (mean + std * popgym_envs::Draws::normal(rng, 1.0)) as f32;
+            *out = (mean + std * popgym_envs::Draws::normal_pair(rng, 1.0)[0]) as f32;
             // Of the number as it is stored: rounding may have moved it by many narrow standard deviations.
             let noise = (f64::from(*out) - mean) / std;
             log_prob += -0.5 * noise * noise - f64::from(log_std) - LN_SQRT_TAU;
         }
         log_prob as f32
+    }
+
+    /// Writes the stored form of the most probable action of one row of parameters: of each discrete component the likeliest
+    /// class (the first of equals), of each real one the mean.
+    pub fn mode(&self, params: &[f32], action: ValueMut<'_>) {
+        let mut at = 0;
+        for (&classes, out) in self.classes.iter().zip(action.discrete) {
+            let logits = &params[at..at + classes];
+            let likeliest = (1..classes).fold(0, |best, class| if logits[class] > logits[best] { class } else { best });
+            *out = likeliest as u8;
+            at += classes;
+        }
+        action.real.copy_from_slice(&params[at..at + self.bounds.len()]);
+    }
+
+    /// What one row of parameters says of each component.
+    pub fn marginals(&self, params: &[f32]) -> Marginals {
+        let mut marginals = Marginals { classes: Vec::new(), reals: Vec::new(), entropy: 0.0 };
+        let mut at = 0;
+        for &classes in &self.classes {
+            let probabilities = softmax(&params[at..at + classes]);
+            let terms = probabilities.iter().filter(|&&p| p > 0.0).map(|p| -p * p.ln());
+            marginals.entropy += terms.sum::<f64>();
+            marginals.classes.push(probabilities);
+            at += classes;
+        }
+        let (means, log_stds) = params[at..].split_at(self.bounds.len());
+        for ((&mean, &log_std), &(low, high)) in means.iter().zip(log_stds).zip(&self.bounds) {
+            let [mean, log_std, low, high] = [mean, log_std, low, high].map(f64::from);
+            marginals.entropy += log_std + LN_SQRT_TAU + 0.5;
+            // As `to_env` maps them.
+            let bounded = low.is_finite() && high.is_finite();
+            let (middle, half) = if bounded { (f64::midpoint(low, high), (high - low) / 2.0) } else { (0.0, 1.0) };
+            marginals.reals.push((middle + mean * half, log_std.exp() * half));
+        }
+        marginals
     }
 
     /// The environment's form of a stored action: discrete components as they are, real ones mapped and clipped.
@@ -145,6 +192,14 @@ impl ActionDistribution {
         }
         sum
     }
+}
+
+/// The probabilities of classes with these logits.
+fn softmax(logits: &[f32]) -> Vec<f64> {
+    let largest = logits.iter().copied().fold(f32::NEG_INFINITY, f32::max);
+    let weights: Vec<f64> = logits.iter().map(|&logit| f64::from(logit - largest).exp()).collect();
+    let total: f64 = weights.iter().sum();
+    weights.iter().map(|weight| weight / total).collect()
 }
 
 /// The class that `uniform` in `[0, 1)` falls on when the classes' probabilities are laid end to end, and its log-probability.

@@ -19,7 +19,7 @@ pub mod packing;
 pub mod policy;
 pub mod weights;
 
-pub use distribution::ActionDistribution;
+pub use distribution::{ActionDistribution, Marginals};
 pub use encoder::Encoder;
 pub use memory::State;
 pub use packing::Packing;

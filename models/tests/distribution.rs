@@ -212,3 +212,38 @@ fn log_standard_deviations_are_kept_within_bounds() {
 fn a_space_without_components_is_refused() {
     assert!(ActionDistribution::new(&Space::Tuple(Vec::new()), UNBOUNDED).is_err());
 }
+
+#[test]
+fn marginals_are_the_closed_forms() {
+    let mixed = distribution(&mixed());
+    let marginals = mixed.marginals(&PARAMS);
+    for (found, expected) in marginals.classes.iter().zip([softmax(&PARAMS[..3]), softmax(&PARAMS[3..5])]) {
+        assert_eq!(found.len(), expected.len());
+        assert!(found.iter().zip(&expected).all(|(a, b)| (a - b).abs() < 1e-12), "{found:?}, not {expected:?}");
+        assert!((found.iter().sum::<f64>() - 1.0).abs() < 1e-12);
+    }
+    // The space is -2 to 2, so a stored 1 is the environment's 2; the log standard deviations are -0.4 and 0.6.
+    for ((mean, std), (stored, log_std)) in marginals.reals.iter().zip([(0.25, -0.4_f64), (-1.5, 0.6)]) {
+        assert!((mean - 2.0 * stored).abs() < 1e-6 && (std - 2.0 * log_std.exp()).abs() < 1e-6, "{mean} {std}");
+    }
+    let [_, entropy, _] = evaluate(&mixed, &PARAMS, &PARAMS, &[0, 0], &[0.0, 0.0]);
+    assert!((marginals.entropy - entropy).abs() < 1e-5, "{} is not {entropy}", marginals.entropy);
+    // An unbounded real is not mapped; a class that is impossible adds nothing to the entropy.
+    let unbounded = distribution(&Space::uniform_box(1, f32::NEG_INFINITY, f32::INFINITY));
+    assert_eq!(unbounded.marginals(&[3.0, 0.0]).reals, [(3.0, 1.0)]);
+    let certain = distribution(&Space::Discrete(2)).marginals(&[0.0, -1e9]);
+    assert_eq!((certain.classes, certain.entropy), (vec![vec![1.0, 0.0]], 0.0));
+}
+
+#[test]
+fn the_mode_is_the_likeliest_class_and_the_mean() {
+    let mixed = distribution(&mixed());
+    let mut action = Slab::new(&mixed.stored_space(), 1);
+    mixed.mode(&PARAMS, action.row_mut(0));
+    assert_eq!((&action.discrete[..], &action.real[..]), (&[2, 0][..], &[0.25, -1.5][..]));
+    // The first of equals.
+    let mut class = [9];
+    distribution(&Space::Discrete(3))
+        .mode(&[1.0, 1.0, 0.0], popgym_envs::ValueMut { discrete: &mut class, real: &mut [] });
+    assert_eq!(class, [0]);
+}

@@ -31,4 +31,4 @@ pub use message::{ActorMessage, LearnerMessage, Leases, OpenEpoch, WeightSet};
 pub use run::{Fingerprint, Hello, RunSpec, fingerprint};
 
 /// Grows with every change after which an older actor and a newer learner would misunderstand each other.
-pub const PROTOCOL_VERSION: u32 = 1;
+pub const PROTOCOL_VERSION: u32 = 2;

@@ -2,6 +2,7 @@
 
 use std::fmt::Write as _;
 
+use popgym_envs::Observability;
 use sha2::{Digest, Sha256};
 
 use crate::error::{name, within};
@@ -17,6 +18,8 @@ pub struct RunSpec {
     pub run: String,
     /// The environment's canonical id.
     pub env: String,
+    /// How much of the environment the agent is shown.
+    pub observability: Observability,
     /// An episode that is this many steps long is truncated there.
     pub max_episode_steps: u32,
     /// The memory's name.
@@ -53,6 +56,7 @@ impl RunSpec {
         Ok(Self {
             run: name("run", wire.run, 1)?,
             env: name("env", wire.env, 1)?,
+            observability: observability(&wire.observability)?,
             max_episode_steps: within("max_episode_steps", wire.max_episode_steps, 1..=limits::MAX_EPISODE_STEPS)?,
             memory: name("memory", wire.memory, 1)?,
             memory_options: table("memory_options", &wire.memory_options)?,
@@ -69,6 +73,7 @@ impl RunSpec {
         wire::RunSpec {
             run: self.run,
             env: self.env,
+            observability: self.observability.name().to_owned(),
             max_episode_steps: self.max_episode_steps,
             memory: self.memory,
             memory_options: self.memory_options.to_string(),
@@ -79,6 +84,14 @@ impl RunSpec {
             evaluation: self.evaluation,
         }
     }
+}
+
+fn observability(value: &str) -> Result<Observability, WireError> {
+    value.parse().map_err(|_| WireError::Value {
+        field: "observability",
+        value: format!("`{}`", value.chars().take(32).collect::<String>().escape_debug()),
+        allowed: Observability::ALL.map(Observability::name).join(", "),
+    })
 }
 
 fn table(field: &'static str, text: &str) -> Result<toml::Table, WireError> {
@@ -150,6 +163,7 @@ pub fn fingerprint(spec: &RunSpec, env_text: &str, policy_signature: &str) -> Fi
     field("protocol", &crate::PROTOCOL_VERSION.to_string());
     field("run", &spec.run);
     field("env", &spec.env);
+    field("observability", spec.observability.name());
     field("max_episode_steps", &spec.max_episode_steps.to_string());
     field("memory", &spec.memory);
     field("memory_options", &spec.memory_options.to_string());

@@ -195,6 +195,7 @@ fn run_spec() -> RunSpec {
     RunSpec {
         run: "first".to_owned(),
         env: "popgym-RepeatPreviousEasy-v0".to_owned(),
+        observability: popgym_envs::Observability::Partial,
         max_episode_steps: 64,
         memory: "gru".to_owned(),
         memory_options: table("hidden = 256\nlayers = 1"),
@@ -219,6 +220,10 @@ fn a_run_survives_the_wire() {
     assert_eq!(refused(&|r| r.run.clear()), "run has length 0, allowed is 1..=128 characters");
     assert_eq!(refused(&|r| r.env = "a\nb".to_owned()), "env is `a\\nb`, allowed is a name without white space");
     assert!(refused(&|r| r.memory_options = "= 3".to_owned()).starts_with("memory_options is not TOML: "));
+    assert_eq!(
+        refused(&|r| r.observability = "all".to_owned()),
+        "observability is `all`, allowed is partial, full-in-info, full, full-and-partial"
+    );
     assert!(refused(&|r| r.policy_options = "[".repeat(100_000)).starts_with("policy_options has length 100000"));
     // Deep nesting must neither overflow the stack nor pass.
     assert!(refused(&|r| r.policy_options = format!("x = {}", "[".repeat(60_000))).contains("not TOML"));
@@ -228,9 +233,10 @@ fn a_run_survives_the_wire() {
 fn the_fingerprint_tells_every_field() {
     let base = fingerprint(&run_spec(), "env", "policy");
     assert_eq!(base, fingerprint(&run_spec(), "env", "policy"));
-    let changes: [&dyn Fn(&mut RunSpec); 9] = [
+    let changes: [&dyn Fn(&mut RunSpec); 10] = [
         &|r| r.run.push('x'),
         &|r| r.env.push('x'),
+        &|r| r.observability = popgym_envs::Observability::Full,
         &|r| r.max_episode_steps += 1,
         &|r| r.memory.push('x'),
         &|r| drop(r.memory_options.insert("hidden".to_owned(), 255.into())),

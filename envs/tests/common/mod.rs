@@ -1,7 +1,9 @@
 //! What several tests need: playing an episode.
 #![allow(dead_code, reason = "each test binary uses a part")]
 
-use popgym_envs::{Draws, Env, EpisodeRng, Purpose, Slab, Step, Value, stream};
+use std::collections::HashMap;
+
+use popgym_envs::{Canvas, Draws, Env, EpisodeRng, Purpose, Slab, Step, Value, View, stream};
 
 /// Everything seen in one episode, `T` steps long.
 #[derive(Clone, Debug, PartialEq)]
@@ -72,4 +74,41 @@ pub(crate) fn play_drawn(
 /// An action or observation of discrete components only.
 pub(crate) fn discrete(classes: &[u8]) -> Value<'_> {
     Value { discrete: classes, real: &[] }
+}
+
+/// What a view of the present moment shows, as text.
+pub(crate) fn picture(env: &dyn Env, view: View) -> String {
+    let mut canvas = Canvas::new();
+    env.render(view, &mut canvas);
+    canvas.to_text()
+}
+
+/// Plays random episodes, and checks that the observed picture, with its colours, tells nothing but the observation and
+/// the last action: wherever these two are the same, so is the picture. (At the reset there is no last action.)
+pub(crate) fn assert_observed_is_all_that_is_shown(env: &mut dyn Env, episodes: u64) {
+    let spec = env.spec().clone();
+    let (mut observation, mut action) = (Slab::new(&spec.observation, 1), Slab::new(&spec.action, 1));
+    let mut shown = HashMap::new();
+    let mut twice = 0;
+    for index in 0..episodes {
+        let mut policy = stream(5, 0, index, Purpose::EvalAction);
+        let mut rng: EpisodeRng = stream(5, 0, index, Purpose::EvalEnv);
+        env.draw_world(&mut rng);
+        env.begin(&mut rng, observation.row_mut(0));
+        let mut last = None;
+        loop {
+            let mut canvas = Canvas::new();
+            env.render(View::Observed, &mut canvas);
+            let bits = |slab: &Slab| (slab.discrete.clone(), slab.real.iter().map(|x| x.to_bits()).collect::<Vec<_>>());
+            let before = shown.insert((bits(&observation), last.is_some().then(|| bits(&action))), canvas.clone());
+            twice += usize::from(before.is_some());
+            assert!(before.is_none_or(|before| before == canvas), "{}: {}", spec.id, canvas.to_text());
+            if last.is_some_and(|step: Step| step.done()) {
+                break;
+            }
+            spec.action.sample_into(&mut policy, action.row_mut(0));
+            last = Some(env.step(action.row(0), &mut rng, observation.row_mut(0)));
+        }
+    }
+    assert!(twice > shown.len(), "{}: too few moments look the same", spec.id);
 }
