@@ -28,6 +28,10 @@ pub enum Command {
     Resume(ResumeArgs),
     /// Play episodes with a trained agent, never those it was trained on
     Eval(EvalArgs),
+    /// Play an environment yourself, in the terminal
+    Play(PlayArgs),
+    /// Watch a trained agent play, in the terminal or as an animated GIF
+    Watch(WatchArgs),
     /// Show what can be named
     List(ListArgs),
 }
@@ -68,6 +72,10 @@ pub struct RunFlags {
     #[arg(long, value_name = "ID")]
     #[serde(skip_serializing_if = "Option::is_none")]
     pub env: Option<String>,
+    /// What the agent is shown: partial, full (the hidden state), full-and-partial, or full-in-info (as partial) [default: partial]
+    #[arg(long, value_name = "LEVEL")]
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub observability: Option<String>,
     /// Where defaults come from (`learner list presets`) [default: quick]
     #[arg(long, value_name = "NAME")]
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -126,6 +134,10 @@ pub struct ServiceFlags {
     #[arg(long, value_name = "N")]
     #[serde(skip_serializing_if = "Option::is_none")]
     pub slots: Option<u32>,
+    /// How a local actor is started: program and first arguments, @self for this program [default: the actor beside it]
+    #[arg(long, value_name = "COMMAND", value_delimiter = ' ')]
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub actor_command: Option<Vec<String>>,
     /// Address for actors [default: 127.0.0.1:0, or 127.0.0.1:50051 with --actors 0]
     #[arg(long, value_name = "ADDR")]
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -186,6 +198,55 @@ pub struct EvalArgs {
     /// Print JSON
     #[arg(long)]
     pub json: bool,
+}
+
+/// `learner play`.
+#[derive(Debug, clap::Args)]
+#[command(after_help = "The keys are shown beside the picture; q, Esc or Ctrl-C leaves.")]
+pub struct PlayArgs {
+    /// Environment (`learner list envs`)
+    #[arg(long, value_name = "ID")]
+    pub env: String,
+    /// Seed of the episodes; the same seed is the same game [default: of the clock]
+    #[arg(long, value_name = "S", allow_negative_numbers = true, value_parser = seed())]
+    pub seed: Option<u64>,
+    /// Show the hidden state, too
+    #[arg(long)]
+    pub reveal: bool,
+    /// Episodes to play
+    #[arg(long, value_name = "N", default_value_t = 1)]
+    pub episodes: u64,
+}
+
+/// `learner watch`.
+#[derive(Debug, clap::Args)]
+#[command(
+    after_help = "Keys: Space pauses, then the right arrow takes one step; + and - change the speed; q, Esc or Ctrl-C leaves."
+)]
+pub struct WatchArgs {
+    /// Directory of the run
+    pub dir: PathBuf,
+    /// Episodes to watch
+    #[arg(long, value_name = "N", default_value_t = 1)]
+    pub episodes: u64,
+    /// Seed of the episodes: those that `learner eval` plays with it, never those of training
+    #[arg(long, value_name = "S", default_value_t = 0, allow_negative_numbers = true, value_parser = seed())]
+    pub seed: u64,
+    /// Which weights: of the checkpoint with the best mean return, or the last
+    #[arg(long, value_enum, default_value_t = Which::Best)]
+    pub checkpoint: Which,
+    /// Steps a second
+    #[arg(long, value_name = "X", default_value_t = 4.0, allow_negative_numbers = true)]
+    pub speed: f64,
+    /// Take the likeliest action, draw none
+    #[arg(long)]
+    pub greedy: bool,
+    /// Show only what the agent sees, not the hidden state
+    #[arg(long)]
+    pub observed: bool,
+    /// Write an animated GIF instead; needs no terminal
+    #[arg(long, value_name = "FILE")]
+    pub gif: Option<PathBuf>,
 }
 
 /// Which checkpoint.

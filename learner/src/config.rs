@@ -7,7 +7,7 @@ use std::net::SocketAddr;
 use std::path::Path;
 
 use anyhow::{Context, bail};
-use popgym_envs::EnvSpec;
+use popgym_envs::{EnvSpec, Observability};
 use popgym_models::{Policy, PolicyOptions, PolicySpec, memory};
 use popgym_proto::RunSpec;
 use serde::{Deserialize, Serialize};
@@ -29,6 +29,8 @@ pub const PRESETS: [(&str, &str); 2] = [
 pub struct Config {
     /// Canonical id of the environment.
     pub env: String,
+    /// How much of the environment the agent is shown: `partial` is the benchmark's task, `full` the hidden state.
+    pub observability: Observability,
     /// The preset that the other keys' defaults come from.
     pub preset: String,
     /// Seed of everything random in the run.
@@ -70,6 +72,9 @@ pub struct ServiceConfig {
     pub actors: u32,
     /// Episodes that a local actor steps at a time.
     pub slots: u32,
+    /// How a local actor is started: a program and its first arguments, `@self` for this program. Empty: the `actor`
+    /// beside this program, or what a user's own program says.
+    pub actor_command: Vec<String>,
     /// Address for actors; empty: any free port of this machine for local actors, port 50051 of this machine for others.
     pub listen: String,
     /// Address for Prometheus; empty: none.
@@ -106,7 +111,8 @@ impl Config {
         let config: Self = table.try_into().map_err(|error: toml::de::Error| anyhow::anyhow!(one_line(&error)))?;
         config.validate()?;
         // Builds and drops a policy: memory and spaces check their own options.
-        Policy::new(&config.policy_spec(&entry.spec), memories, Device::Cpu)?;
+        let observed = entry.observed(config.observability)?;
+        Policy::new(&config.policy_spec(&observed), memories, Device::Cpu)?;
         Ok(config)
     }
 
@@ -182,6 +188,7 @@ impl Config {
         Ok(RunSpec {
             run: run.to_owned(),
             env: self.env.clone(),
+            observability: self.observability,
             max_episode_steps: self.max_episode_steps,
             memory: self.memory_name().to_owned(),
             memory_options: self.memory_options(),
@@ -221,7 +228,10 @@ impl Config {
         range("keep_checkpoints", u64::from(self.keep_checkpoints), 1, 1000)?;
         range("service.actors", u64::from(self.service.actors), 0, MAX_LOCAL_ACTORS)?;
         range("service.slots", u64::from(self.service.slots), 1, u64::from(popgym_proto::limits::MAX_SLOTS))?;
-        let ServiceConfig { listen, metrics_listen, .. } = &self.service;
+        let ServiceConfig { listen, metrics_listen, actor_command, .. } = &self.service;
+        if actor_command.iter().any(|word| word.is_empty() || word.contains('\0')) {
+            bail!("service.actor_command is {actor_command:?}, allowed is a program and arguments, none of them empty");
+        }
         let is_address = |(host, port): (&str, &str)| !host.is_empty() && port.parse::<u16>().is_ok();
         if !listen.is_empty() && !listen.rsplit_once(':').is_some_and(is_address) {
             bail!("service.listen is `{listen}`, allowed is HOST:PORT");
@@ -260,6 +270,7 @@ fn preset_table(name: &str, env: &EnvSpec) -> anyhow::Result<Table> {
     let cores = std::thread::available_parallelism().map_or(1, std::num::NonZero::get) as u32;
     let config = Config {
         env: env.id.clone(),
+        observability: Observability::Partial,
         preset: name.to_owned(),
         seed: 0,
         lag: 0,
@@ -272,7 +283,13 @@ fn preset_table(name: &str, env: &EnvSpec) -> anyhow::Result<Table> {
         rows: 128,
         checkpoint_epochs: 10,
         keep_checkpoints: 3,
-        service: ServiceConfig { actors: cores, slots: 128, listen: String::new(), metrics_listen: String::new() },
+        service: ServiceConfig {
+            actors: cores,
+            slots: 128,
+            actor_command: Vec::new(),
+            listen: String::new(),
+            metrics_listen: String::new(),
+        },
         memory: Table::from_iter([("name".to_owned(), Value::String("gru".to_owned()))]),
         policy: PolicyOptions { log_std_min: log_std.0, log_std_max: log_std.1 },
         ppo,

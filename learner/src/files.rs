@@ -9,8 +9,7 @@ use anyhow::Context as _;
 /// Writes a file under a temporary name beside `path` by `write`, then renames it to `path`: readers see the old file
 /// or the new one, whole. The temporary name keeps the extension.
 pub(crate) fn replace(path: &Path, write: impl FnOnce(&Path) -> anyhow::Result<()>) -> anyhow::Result<()> {
-    let name = path.file_name().with_context(|| format!("{} names no file", path.display()))?;
-    let partial = path.with_file_name(format!(".partial-{}", name.to_string_lossy()));
+    let partial = partial(path)?;
     let done: anyhow::Result<()> = (|| {
         write(&partial)?;
         File::open(&partial)?.sync_all()?;
@@ -25,6 +24,23 @@ pub(crate) fn replace(path: &Path, write: impl FnOnce(&Path) -> anyhow::Result<(
         let _ = fs::remove_file(&partial);
     }
     done.with_context(|| format!("cannot write {}", path.display()))
+}
+
+/// Checks that [`replace`] can begin: that there is no directory at `path`, and that its own can be written to.
+pub(crate) fn check_writable(path: &Path) -> anyhow::Result<()> {
+    let check = || {
+        anyhow::ensure!(!path.is_dir(), "it is a directory");
+        let partial = partial(path)?;
+        File::create(&partial)?;
+        Ok(fs::remove_file(&partial)?)
+    };
+    check().with_context(|| format!("cannot write {}", path.display()))
+}
+
+/// The temporary name beside `path`.
+fn partial(path: &Path) -> anyhow::Result<PathBuf> {
+    let name = path.file_name().with_context(|| format!("{} names no file", path.display()))?;
+    Ok(path.with_file_name(format!(".partial-{}", name.to_string_lossy())))
 }
 
 /// Replaces the file at `path` by `text`, as [`replace`] does.
@@ -97,6 +113,21 @@ mod tests {
         assert_eq!(fs::read_dir(&dir).unwrap().count(), 1, "the partial file is left behind");
         replace(&path, |partial| Ok(fs::write(partial, "new")?)).unwrap();
         assert_eq!(fs::read_to_string(&path).unwrap(), "new");
+    }
+
+    #[test]
+    fn writable_or_not() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("a.txt");
+        check_writable(&path).unwrap();
+        assert_eq!(fs::read_dir(&dir).unwrap().count(), 0, "the check leaves nothing behind");
+        fs::write(&path, "old").unwrap();
+        check_writable(&path).unwrap();
+        assert_eq!(fs::read_to_string(&path).unwrap(), "old");
+        for bad in [dir.path().to_owned(), path.join("below a file"), dir.path().join("gone/a.txt"), "..".into()] {
+            let error = format!("{:#}", check_writable(&bad).unwrap_err());
+            assert!(error.contains(&bad.display().to_string()), "{error}");
+        }
     }
 
     #[test]

@@ -2,19 +2,22 @@
 //!
 //! | module | holds |
 //! |---|---|
-//! | [`commands`] | `train`, `resume`, `eval`, `list` |
+//! | [`commands`] | `train`, `resume`, `eval`, `play`, `watch`, `list` |
 //! | [`config`], [`ppo_keys`] | the configuration: presets, file and flags merged |
 //! | [`trainer`] | the epochs of a run, one after the other |
 //! | [`update`] | PPO, top to bottom; [`gae`], [`adam`] and [`batch`] are what it uses |
 //! | [`service`] | sessions with actors, leases, episodes |
 //! | [`local_actors`] | actor processes on this machine |
 //! | [`checkpoint`], [`run_dir`] | what a run leaves on disk to continue from |
+//! | `screen` | environments on a terminal and as animated images: what `play` and `watch` show |
+//! | [`baseline`], [`space_text`] | what acting at random scores; spaces in words |
 //! | [`observer`] | what a run tells: files, progress bar, TensorBoard, Prometheus |
 //!
 //! A user's own `main` adds environments, memories and observers to [`Extensions`] and calls [`run`].
 
 pub mod adam;
 pub mod args;
+pub mod baseline;
 pub mod batch;
 pub mod checkpoint;
 pub mod commands;
@@ -26,8 +29,10 @@ pub mod local_actors;
 pub mod observer;
 pub mod ppo_keys;
 pub mod run_dir;
+mod screen;
 pub mod service;
 pub mod session;
+pub mod space_text;
 pub mod trainer;
 pub mod update;
 pub mod waiting;
@@ -50,6 +55,9 @@ pub struct Extensions {
     pub memories: popgym_models::memory::Registry,
     /// Observers beside those of the learner.
     pub observers: Vec<Box<dyn Observer>>,
+    /// How local actors are started unless the key `service.actor_command` says it: a program and its first arguments.
+    /// [`local_actors::THIS_PROGRAM`] stands for the running program. Empty: the `actor` beside it.
+    pub actor_command: Vec<String>,
 }
 
 impl Default for Extensions {
@@ -58,6 +66,7 @@ impl Default for Extensions {
             envs: popgym_envs::Registry::standard(),
             memories: popgym_models::memory::Registry::standard(),
             observers: Vec::new(),
+            actor_command: Vec::new(),
         }
     }
 }
@@ -86,6 +95,8 @@ pub fn run(extensions: Extensions, arguments: impl IntoIterator<Item = OsString>
         Command::Train(args) => commands::train(&args, extensions),
         Command::Resume(args) => commands::resume(&args, extensions),
         Command::Eval(args) => commands::eval(&args, &extensions),
+        Command::Play(args) => commands::play(&args, &extensions),
+        Command::Watch(args) => commands::watch(&args, &extensions),
         Command::List(args) => commands::list(&args, &extensions),
     };
     match result {

@@ -1,8 +1,9 @@
 //! Actor processes on this machine: started, watched, restarted, and gone when the learner is.
 
+use std::ffi::OsString;
 use std::io;
 use std::os::unix::process::CommandExt as _;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::process::{Child, Command, ExitStatus, Stdio};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -37,6 +38,61 @@ impl Hopeless {
     }
 }
 
+/// In the place of a program's name: the program that is running.
+pub const THIS_PROGRAM: &str = "@self";
+
+/// How an actor is started.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct ActorCommand {
+    program: PathBuf,
+    args: Vec<OsString>,
+}
+
+impl ActorCommand {
+    /// What `words` say: a program (a path, a name to be found on PATH, or [`THIS_PROGRAM`]) and its first arguments. No
+    /// words: the `actor` beside the running program.
+    ///
+    /// # Errors
+    /// There is no such program.
+    pub fn find(words: &[String]) -> anyhow::Result<Self> {
+        let this = std::env::current_exe().context("cannot tell where this program is")?;
+        let Some((program, args)) = words.split_first() else {
+            let program = this.with_file_name("actor");
+            anyhow::ensure!(
+                program.is_file(),
+                "{} is not there; `make build` builds it, `--actor-command` names another, `--actors 0` waits for actors elsewhere",
+                program.display()
+            );
+            return Ok(Self { program, args: Vec::new() });
+        };
+        let program = match program.as_str() {
+            THIS_PROGRAM => this,
+            name => which::which(name).with_context(|| format!("service.actor_command is {words:?}: `{name}`"))?,
+        };
+        Ok(Self { program, args: args.iter().map(OsString::from).collect() })
+    }
+
+    /// The same with further arguments.
+    #[must_use]
+    pub fn with(mut self, args: impl IntoIterator<Item = impl Into<OsString>>) -> Self {
+        self.args.extend(args.into_iter().map(Into::into));
+        self
+    }
+
+    fn start(&self) -> io::Result<Child> {
+        let mut command = Command::new(&self.program);
+        // The pipe is never written to: it ends when this process does, however that happens.
+        command.args(&self.args).arg("--with-parent").stdin(Stdio::piped()).stdout(Stdio::null());
+        // Ctrl-C in a terminal goes to its whole process group. It is the learner that decides what it means.
+        command.process_group(0);
+        if std::env::var_os("RUST_LOG").is_none() {
+            // They share the learner's terminal, and its log says who joined.
+            command.env("RUST_LOG", "warn");
+        }
+        command.spawn()
+    }
+}
+
 /// A number of actor processes. Dropping it stops them all.
 #[derive(Debug)]
 pub struct LocalActors {
@@ -47,24 +103,19 @@ pub struct LocalActors {
 }
 
 impl LocalActors {
-    /// Starts `n` processes of `program` with `args` (and `--with-parent`), and watches over them.
+    /// Starts `n` processes by `command` (and `--with-parent`), and watches over them.
     ///
     /// # Errors
-    /// If the program is missing or cannot be started.
-    pub fn spawn(n: usize, program: PathBuf, args: Vec<String>) -> anyhow::Result<Self> {
-        anyhow::ensure!(
-            program.is_file(),
-            "the actor's program is missing: {}; build it with `make build`",
-            program.display()
-        );
+    /// If the program cannot be started.
+    pub fn spawn(n: usize, command: ActorCommand) -> anyhow::Result<Self> {
         let now = Instant::now();
         let mut actors = Vec::with_capacity(n);
         for _ in 0..n {
-            match start(&program, &args) {
+            match command.start() {
                 Ok(child) => actors.push(Actor { child: Some(child), since: now, wait: FIRST_WAIT, failures: 0 }),
                 Err(error) => {
                     stop_all(actors);
-                    return Err(error).with_context(|| format!("cannot start {}", program.display()));
+                    return Err(error).with_context(|| format!("cannot start {}", command.program.display()));
                 }
             }
         }
@@ -72,7 +123,7 @@ impl LocalActors {
         let (stop, stopped) = channel();
         let watcher = std::thread::Builder::new().name("local-actors".to_owned()).spawn({
             let hopeless = hopeless.clone();
-            move || watch(actors, &program, &args, &stopped, &hopeless)
+            move || watch(actors, &command, &stopped, &hopeless)
         })?;
         Ok(Self { stop: Some(stop), watcher: Some(watcher), hopeless })
     }
@@ -109,24 +160,11 @@ struct Actor {
     failures: u32,
 }
 
-fn start(program: &Path, args: &[String]) -> io::Result<Child> {
-    let mut command = Command::new(program);
-    // The pipe is never written to: it ends when this process does, however that happens.
-    command.args(args).arg("--with-parent").stdin(Stdio::piped()).stdout(Stdio::null());
-    // Ctrl-C in a terminal goes to its whole process group. It is the learner that decides what it means.
-    command.process_group(0);
-    if std::env::var_os("RUST_LOG").is_none() {
-        // They share the learner's terminal, and its log says who joined.
-        command.env("RUST_LOG", "warn");
-    }
-    command.spawn()
-}
-
-fn watch(mut actors: Vec<Actor>, program: &Path, args: &[String], stopped: &Receiver<()>, hopeless: &Hopeless) {
+fn watch(mut actors: Vec<Actor>, command: &ActorCommand, stopped: &Receiver<()>, hopeless: &Hopeless) {
     // The sender sends nothing; it is dropped.
     while matches!(stopped.recv_timeout(POLL_INTERVAL), Err(RecvTimeoutError::Timeout)) {
         for actor in &mut actors {
-            actor.look_after(program, args);
+            actor.look_after(command);
             hopeless.0.fetch_or(actor.failures >= HOPELESS_FAILURES, Ordering::Relaxed);
         }
     }
@@ -134,7 +172,7 @@ fn watch(mut actors: Vec<Actor>, program: &Path, args: &[String], stopped: &Rece
 }
 
 impl Actor {
-    fn look_after(&mut self, program: &Path, args: &[String]) {
+    fn look_after(&mut self, command: &ActorCommand) {
         match &mut self.child {
             Some(child) => {
                 // An error means that there is no such process to wait for.
@@ -155,13 +193,13 @@ impl Actor {
                     self.died(wait);
                 }
             }
-            None if self.since.elapsed() >= self.wait => match start(program, args) {
+            None if self.since.elapsed() >= self.wait => match command.start() {
                 Ok(child) => {
                     self.wait = (2 * self.wait).min(LONGEST_WAIT);
                     (self.child, self.since) = (Some(child), Instant::now());
                 }
                 Err(error) => {
-                    warn!("cannot start {}: {error}", program.display());
+                    warn!("cannot start {}: {error}", command.program.display());
                     self.died(LONGEST_WAIT);
                 }
             },
@@ -200,14 +238,17 @@ fn stop_all(actors: Vec<Actor>) {
 
 #[cfg(test)]
 mod tests {
+    use std::path::Path;
+
     use super::*;
 
-    /// A shell script as an actor: `body` gets `$1` = the file to write to.
-    fn script(dir: &Path, body: &str) -> PathBuf {
+    /// A shell script as an actor: `body` gets `$1` = the file `log`.
+    fn script(dir: &Path, body: &str) -> ActorCommand {
         let path = dir.join("actor.sh");
         std::fs::write(&path, format!("#!/bin/sh\n{body}\n")).unwrap();
         std::fs::set_permissions(&path, std::os::unix::fs::PermissionsExt::from_mode(0o755)).unwrap();
-        path
+        let words = [path.display().to_string(), dir.join("log").display().to_string()];
+        ActorCommand::find(&words).unwrap()
     }
 
     fn wait_for(what: &str, mut done: impl FnMut() -> bool) {
@@ -226,8 +267,8 @@ mod tests {
     fn actors_end_with_their_standard_input() {
         let dir = tempfile::tempdir().unwrap();
         let log = dir.path().join("log");
-        let program = script(dir.path(), "echo up >> $1; cat > /dev/null; echo down >> $1");
-        let actors = LocalActors::spawn(3, program, vec![log.display().to_string()]).unwrap();
+        let command = script(dir.path(), "echo up >> $1; cat > /dev/null; echo down >> $1");
+        let actors = LocalActors::spawn(3, command).unwrap();
         wait_for("three actors", || lines(&log) == 3);
         actors.stop();
         assert_eq!(std::fs::read_to_string(&log).unwrap().matches("down").count(), 3);
@@ -237,8 +278,7 @@ mod tests {
     fn a_dead_actor_is_replaced() {
         let dir = tempfile::tempdir().unwrap();
         let log = dir.path().join("log");
-        let program = script(dir.path(), "echo up >> $1; exit 1");
-        let _actors = LocalActors::spawn(1, program, vec![log.display().to_string()]).unwrap();
+        let _actors = LocalActors::spawn(1, script(dir.path(), "echo up >> $1; exit 1")).unwrap();
         wait_for("a second life", || lines(&log) >= 2);
     }
 
@@ -246,8 +286,7 @@ mod tests {
     fn actors_that_fail_again_and_again_are_hopeless_and_killed_ones_are_not() {
         let dir = tempfile::tempdir().unwrap();
         let log = dir.path().join("log");
-        let spawn =
-            |body: &str| LocalActors::spawn(1, script(dir.path(), body), vec![log.display().to_string()]).unwrap();
+        let spawn = |body: &str| LocalActors::spawn(1, script(dir.path(), body)).unwrap();
         let killed = spawn("echo up >> $1; kill -9 $$");
         wait_for("a third life", || lines(&log) >= 3);
         assert!(!killed.hopeless().is_set());
@@ -257,8 +296,14 @@ mod tests {
     }
 
     #[test]
-    fn a_missing_program_says_how_to_build_it() {
-        let error = LocalActors::spawn(1, PathBuf::from("no-such-program"), Vec::new()).unwrap_err().to_string();
-        assert!(error.contains("make build"), "{error}");
+    fn a_command_is_found_or_named() {
+        let find = |words: &[&str]| ActorCommand::find(&words.iter().map(ToString::to_string).collect::<Vec<_>>());
+        let this = std::env::current_exe().unwrap();
+        assert_eq!(find(&["@self", "actor"]).unwrap(), ActorCommand { program: this, args: vec!["actor".into()] });
+        assert!(find(&["sh"]).unwrap().program.ends_with("sh"));
+        assert!(find(&[]).unwrap_err().to_string().contains("make build"), "tests have no actor beside them");
+        for missing in ["no-such-program", "./no-such-program", "/"] {
+            assert!(format!("{:#}", find(&[missing]).unwrap_err()).contains(&format!("`{missing}`")));
+        }
     }
 }

@@ -2,7 +2,6 @@
 //! actors, made from a configuration.
 
 use std::net::TcpListener;
-use std::path::PathBuf;
 
 use anyhow::Context;
 use popgym_envs::{EnvSpec, Purpose, Space, stream};
@@ -13,7 +12,7 @@ use tch::Device;
 
 use crate::Extensions;
 use crate::config::Config;
-use crate::local_actors::{Hopeless, LocalActors};
+use crate::local_actors::{ActorCommand, Hopeless, LocalActors};
 use crate::service::Service;
 
 /// One learner at work, with its actors.
@@ -28,6 +27,8 @@ pub struct Session<'a> {
     signature: String,
     /// Space of the actions that episodes store.
     stored_action: Space,
+    /// How local actors are started where the configuration does not say it.
+    actor_command: Vec<String>,
     listener: Option<TcpListener>,
     service: Option<Service>,
     actors: Option<LocalActors>,
@@ -41,7 +42,7 @@ impl<'a> Session<'a> {
     pub fn new(config: &'a Config, extensions: &Extensions) -> anyhow::Result<Self> {
         let device = popgym_models::device::parse(&config.device)?;
         popgym_models::device::set_threads(config.threads);
-        let env = extensions.envs.get(&config.env)?.spec.clone();
+        let env = extensions.envs.get(&config.env)?.observed(config.observability)?;
         let policy_spec = config.policy_spec(&env);
         let policy = Policy::new(&policy_spec, &extensions.memories, Device::Cpu)?;
         Ok(Self {
@@ -53,6 +54,7 @@ impl<'a> Session<'a> {
             parameters: policy.parameters().values().map(|tensor| tensor.numel() as i64).sum(),
             signature: policy.signature(),
             stored_action: policy.distribution().stored_space(),
+            actor_command: extensions.actor_command.clone(),
             listener: None,
             service: None,
             actors: None,
@@ -101,7 +103,7 @@ impl<'a> Session<'a> {
     pub fn listen(&mut self) -> anyhow::Result<()> {
         let service = &self.config.service;
         if service.actors > 0 {
-            actor_program()?;
+            self.actor_command()?;
         }
         let listen = match (service.listen.as_str(), service.actors) {
             ("", 0) => "127.0.0.1:50051",
@@ -145,11 +147,16 @@ impl<'a> Session<'a> {
                 // They sample while the learner learns on the same cores: they get what it leaves.
                 args.extend(["--nice".to_owned(), "19".to_owned()]);
             }
-            self.actors = Some(LocalActors::spawn(service.actors as usize, actor_program()?, args)?);
+            self.actors = Some(LocalActors::spawn(service.actors as usize, self.actor_command()?.with(args))?);
         } else {
             tracing::info!("waiting for actors: actor --learner http://{address}");
         }
         Ok(())
+    }
+
+    fn actor_command(&self) -> anyhow::Result<ActorCommand> {
+        let given = &self.config.service.actor_command;
+        ActorCommand::find(if given.is_empty() { &self.actor_command } else { given })
     }
 
     /// Tells when the local actors fail again and again.
@@ -175,18 +182,6 @@ impl<'a> Session<'a> {
             actors.stop();
         }
     }
-}
-
-/// The `actor` program beside this one.
-fn actor_program() -> anyhow::Result<PathBuf> {
-    let here = std::env::current_exe().context("cannot tell where this program is")?;
-    let actor = here.with_file_name("actor");
-    anyhow::ensure!(
-        actor.exists(),
-        "{} is not there; `make build` builds it, or `--actors 0` waits for actors elsewhere",
-        actor.display()
-    );
-    Ok(actor)
 }
 
 fn serve_metrics(address: &str) -> anyhow::Result<()> {

@@ -5,6 +5,7 @@
 //! |---|---|
 //! | [`process`] | one `learner` or `actor`: start, signals, log, end |
 //! | [`scene`] | a temporary directory with a tiny configuration, and the runs in it |
+//! | [`terminal`] | a program on a terminal of its own: keys in, the screen out |
 //! | [`net`] | a free port, a plain HTTP request, the health service |
 //!
 //! Every wait has the same generous deadline: it only tells a test that hangs from one on a busy machine.
@@ -15,9 +16,11 @@ use std::time::{Duration, Instant};
 pub mod net;
 pub mod process;
 pub mod scene;
+pub mod terminal;
 
 pub use process::{Outcome, Process, Program};
 pub use scene::Scene;
+pub use terminal::Terminal;
 
 /// A test that waits longer than this for anything has failed.
 pub const DEADLINE: Duration = Duration::from_mins(2);

@@ -7,6 +7,7 @@ use serde_json::Value;
 use tempfile::TempDir;
 
 use crate::process::{Process, Program};
+use crate::terminal::Terminal;
 
 /// A configuration whose epochs take some hundredths of a second: 8 of them.
 const TINY: &str = "
@@ -84,6 +85,13 @@ impl Scene {
         let mut command = program.command();
         command.args(args).current_dir(self.dir.path());
         Process::start(&format!("{} {}", program.name(), args.join(" ")), command)
+    }
+
+    /// Starts `learner` on a terminal of its own.
+    pub fn on_terminal(&self, size: (u16, u16), args: &[&str]) -> Terminal {
+        let mut command = Program::Learner.command();
+        command.args(args).current_dir(self.dir.path());
+        Terminal::start(&format!("learner {}", args.join(" ")), command, size)
     }
 
     /// Starts `learner`.

@@ -106,6 +106,7 @@ fn values_out_of_range_in_the_file() {
 
 #[test]
 fn values_out_of_range_as_flags() {
+    assert_bad_flags(&["--observability", "all"], &["observability is `all`", "full-and-partial"]);
     assert_bad_flags(&["--lag", "2"], &["lag is 2", "0 to 1"]);
     assert_bad_flags(&["--gamma", "2"], &["ppo.gamma is 2", "0 to 1"]);
     assert_bad_flags(&["--gamma", "-0.5"], &["ppo.gamma is -0.5"]);
@@ -178,6 +179,14 @@ fn addresses_that_cannot_be_listened_on() {
 }
 
 #[test]
+fn actor_commands_that_cannot_be_started() {
+    let scene = Scene::new();
+    let flags = ["--actor-command", "no-such-program actor"];
+    assert_failure(scene.train("run", &flags), "--actor-command", &["service.actor_command", "`no-such-program`"]);
+    scene.train("run", &["--continue"]).expect(0);
+}
+
+#[test]
 fn runs_whose_files_are_damaged() {
     let scene = Scene::new();
     scene.curve("run", &["--steps", "2048"]);
@@ -238,6 +247,40 @@ fn impossible_evaluations() {
     assert_one_line(&outcome, "no steps", &["steps is 0"]);
     let outcome = scene.resume("run", &["--device", "gpu"]).expect(2);
     assert_one_line(&outcome, "no device", &["device is `gpu`"]);
+}
+
+#[test]
+fn impossible_games() {
+    let scene = Scene::new();
+    let refused =
+        |args: &[&str], expected: &[&str]| assert_one_line(&scene.learner(args).expect(2), expected[0], expected);
+    refused(&["play", "--env", "RepeatPreviousEzy"], &["`RepeatPreviousEzy`", "`RepeatPreviousEasy`"]);
+    refused(&["play", "--env", "RepeatPreviousEasy", "--episodes", "0"], &["--episodes is 0", "1 or more"]);
+    refused(&["play", "--env", "RepeatPreviousEasy"], &["learner play", "a terminal", "standard input"]);
+    assert_usage(&["play"], "--env");
+    assert_usage(&["play", "--env", "RepeatPreviousEasy", "--seed", "-1"], "--seed");
+    refused(&["watch", "."], &["holds no run"]);
+    refused(&["watch", "gone"], &["gone holds no run"]);
+    let mut learner = scene.train("empty", &["--actors", "0", "--listen", "127.0.0.1:0"]);
+    learner.url();
+    refused(&["watch", "empty", "--gif", "a.gif"], &["empty holds no checkpoint yet"]);
+    drop(learner);
+    scene.curve("run", &["--steps", "512"]);
+    refused(&["watch", "run"], &["learner watch", "a terminal", "--gif"]);
+    for speed in ["0", "-1", "NaN", "inf", "1e9"] {
+        refused(&["watch", "run", "--gif", "a.gif", "--speed", speed], &["--speed is ", "allowed is 0.01 to 1000"]);
+    }
+    refused(&["watch", "run", "--gif", "a.gif", "--episodes", "0"], &["--episodes is 0"]);
+    assert_usage(&["watch", "run", "--speed", "fast"], "--speed");
+    assert_usage(&["watch", "run", "--checkpoint", "bets"], "best");
+    for path in ["gone/a.gif", "run", "tiny.toml/a.gif", ".."] {
+        refused(&["watch", "run", "--gif", path], &["cannot write ", path]);
+    }
+    assert!(!scene.path("a.gif").exists());
+    // A checkpoint that is not what it was.
+    let checkpoint = scene.checkpoints("run").pop().unwrap();
+    scene.write(&format!("run/checkpoints/{checkpoint}/weights.safetensors"), "damaged");
+    assert_failure(scene.learner(&["watch", "run", "--gif", "a.gif"]), "damaged weights", &["weights.safetensors"]);
 }
 
 /// A command of a shell that runs the learner as `"$@"`.

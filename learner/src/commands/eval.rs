@@ -1,13 +1,13 @@
 //! `learner eval`: episodes played with a trained agent, on streams of their own.
 
+use anyhow::Context as _;
 use bytes::Bytes;
 use popgym_proto::Episode;
 use serde::Serialize;
 
-use super::{Failure, Outcome, say};
+use super::{Failure, Outcome, choose_checkpoint, say};
 use crate::Extensions;
-use crate::args::{EvalArgs, Which};
-use crate::checkpoint::{self, Checkpoint};
+use crate::args::EvalArgs;
 use crate::config::Config;
 use crate::gae::mean_and_variance;
 use crate::interrupt::{EXIT_INTERRUPTED, Interrupt};
@@ -39,7 +39,8 @@ pub fn eval(args: &EvalArgs, extensions: &Extensions) -> Outcome {
     let config = configure(args, extensions).map_err(Failure::Usage)?;
     let interrupt = Interrupt::listen()?;
     let mut session = Session::new(&config, extensions)?;
-    let checkpoint = choose(args, session.parameters())?;
+    let checkpoint = choose_checkpoint(&args.dir, args.checkpoint, session.parameters())?
+        .with_context(|| format!("{} holds no checkpoint yet", args.dir.display()))?;
     session.policy()?.load(&checkpoint.weights).map_err(anyhow::Error::from)?;
     session.serve(&format!("evaluation-{}", std::process::id()), true)?;
     let service = session.service()?;
@@ -74,18 +75,6 @@ fn configure(args: &EvalArgs, extensions: &Extensions) -> anyhow::Result<Config>
     config.service.metrics_listen.clear();
     config.validate()?;
     Ok(config)
-}
-
-fn choose(args: &EvalArgs, parameters: i64) -> anyhow::Result<Checkpoint> {
-    let checkpoints = args.dir.join("checkpoints");
-    let chosen = match args.checkpoint {
-        Which::Last => Checkpoint::latest(&checkpoints, parameters, u64::MAX)?,
-        Which::Best => match checkpoint::best(&checkpoints)? {
-            Some(path) => Some(Checkpoint::load(&path, parameters)?),
-            None => None,
-        },
-    };
-    chosen.ok_or_else(|| anyhow::anyhow!("{} holds no checkpoint yet", args.dir.display()))
 }
 
 fn report(config: &Config, checkpoint_epoch: u64, episodes: &[Episode]) -> Report {

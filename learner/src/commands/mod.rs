@@ -1,14 +1,22 @@
 //! The user's commands.
 
 use std::io::{ErrorKind, Write};
+use std::path::Path;
+
+use crate::args::Which;
+use crate::checkpoint::{self, Checkpoint};
 
 mod eval;
 mod list;
+mod play;
 mod train;
+mod watch;
 
 pub use eval::eval;
 pub use list::list;
+pub use play::play;
 pub use train::{resume, train};
+pub use watch::watch;
 
 /// Why a command did not succeed.
 #[derive(Debug)]
@@ -30,6 +38,18 @@ fn say(text: &str) -> anyhow::Result<()> {
     match writeln!(std::io::stdout(), "{text}") {
         Err(error) if error.kind() != ErrorKind::BrokenPipe => Err(error.into()),
         _ => Ok(()),
+    }
+}
+
+/// The checkpoint of the run in `dir` that the user has asked for, if there is any; its optimiser has `parameters` numbers.
+fn choose_checkpoint(dir: &Path, which: Which, parameters: i64) -> anyhow::Result<Option<Checkpoint>> {
+    let checkpoints = dir.join("checkpoints");
+    match which {
+        Which::Last => Checkpoint::latest(&checkpoints, parameters, u64::MAX),
+        Which::Best => {
+            let best = checkpoint::best(&checkpoints)?;
+            best.map(|path| Checkpoint::load(&path, parameters)).transpose()
+        }
     }
 }
 

@@ -18,6 +18,7 @@ fn service() -> Service {
     let spec = RunSpec {
         run: "test".to_owned(),
         env: "env".to_owned(),
+        observability: popgym_envs::Observability::Partial,
         max_episode_steps: MAX_STEPS,
         memory: "gru".to_owned(),
         memory_options: toml::Table::new(),
