@@ -76,13 +76,14 @@ impl Rollout {
     ) -> anyhow::Result<Self> {
         let slots = slots as usize;
         let envs = VecEnv::observing(envs, &spec.env, spec.observability, slots)?;
-        let EnvSpec { observation, action, .. } = envs.spec();
+        let EnvSpec { observation, action, max_steps, .. } = envs.spec();
         let policy_spec = PolicySpec {
             observation: observation.clone(),
             action: action.clone(),
             memory: spec.memory.clone(),
             memory_options: spec.memory_options.clone(),
             options: spec.policy_options.clone().try_into()?,
+            max_steps: *max_steps,
         };
         let policy = Policy::new(&policy_spec, memories, Device::Cpu)?;
         let stored = policy.distribution().stored_space();

@@ -254,6 +254,7 @@ mod tests {
             memory: "gru".to_owned(),
             memory_options: toml::Table::from_iter([("hidden_size".to_owned(), toml::Value::Integer(8))]),
             options: PolicyOptions { log_std_min: f64::NEG_INFINITY, log_std_max: f64::INFINITY },
+            max_steps: 10,
         };
         tch::manual_seed(3);
         Policy::new(&spec, &memory::Registry::standard(), Device::Cpu).unwrap()

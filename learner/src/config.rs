@@ -177,6 +177,7 @@ impl Config {
             memory: self.memory_name().to_owned(),
             memory_options: self.memory_options(),
             options: self.policy,
+            max_steps: env.max_steps,
         }
     }
 

@@ -17,6 +17,7 @@ mod init;
 pub mod memory;
 pub mod packing;
 pub mod policy;
+mod positional;
 pub mod weights;
 
 pub use distribution::{ActionDistribution, Marginals};

@@ -3,6 +3,8 @@
 //! Packed rows stand time step by time step, the sequences of each step in order of falling length: all first steps,
 //! all second steps, and so on, like PyTorch's `PackedSequence`. A sequence that has ended is simply no longer there.
 
+use std::ops::Range;
+
 use tch::{Device, Tensor};
 
 /// How sequences of given lengths are packed.
@@ -50,6 +52,21 @@ impl Packing {
     /// Number of sequences alive at each time step, falling.
     pub fn batch_sizes(&self) -> &[i64] {
         &self.batch_sizes
+    }
+
+    /// The packed rows of each time step.
+    pub fn steps(&self) -> impl Iterator<Item = Range<usize>> {
+        self.batch_sizes.iter().scan(0, |start, &alive| {
+            let first = *start;
+            *start += alive as usize;
+            Some(first..*start)
+        })
+    }
+
+    /// The time step of each packed row, `[rows]`.
+    pub(crate) fn times(&self, device: Device) -> Tensor {
+        let times = self.batch_sizes.iter().zip(0..).flat_map(|(&alive, t)| std::iter::repeat_n(t, alive as usize));
+        Tensor::from_slice(&times.collect::<Vec<i64>>()).to_device(device)
     }
 
     /// The batch sizes as PyTorch's packed operators want them: i64 on the CPU.

@@ -2,6 +2,7 @@
 //!
 //! ```text
 //! u = LayerNorm(W0 x + b0)              128 wide, no affine part
+//! u = (1 - s) u + s PE[t]               where the memory wants a positional encoding (`positional.rs`)
 //! z = LeakyReLU(W1 u + b1)              128 wide
 //! m = memory(z)
 //! actor, critic: Linear 128, LeakyReLU, Linear 128, LeakyReLU, Linear to the outputs; nothing shared after m
@@ -25,6 +26,7 @@ use crate::encoder::Encoder;
 use crate::init::{Linear, ORTHOGONAL, SMALL_NORMAL, leaky_relu};
 use crate::memory::{self, Backward, Memory, State};
 use crate::packing::Packing;
+use crate::positional::PositionalEncoding;
 use crate::weights::{self, WeightsError};
 
 /// Width of the projection and of the heads' layers.
@@ -53,6 +55,8 @@ pub struct PolicySpec {
     pub memory_options: toml::Table,
     /// Options of the policy.
     pub options: PolicyOptions,
+    /// The most steps of an episode.
+    pub max_steps: u32,
 }
 
 /// A recurrent actor-critic.
@@ -61,6 +65,7 @@ pub struct Policy {
     parameters: BTreeMap<String, Tensor>,
     encoder: Encoder,
     projection: Linear,
+    positional: Option<PositionalEncoding>,
     preprocessor: Linear,
     memory: Box<dyn Memory>,
     actor: Head,
@@ -115,10 +120,13 @@ impl Policy {
         let projection = Linear::new(&(&root / "projection"), encoder.width() as i64, WIDTH, ORTHOGONAL);
         let preprocessor = Linear::new(&(&root / "preprocessor"), WIDTH, WIDTH, ORTHOGONAL);
         let memory = memories.get(&spec.memory)?.build(&(&root / "memory"), WIDTH, &spec.memory_options)?;
+        let positional = memory
+            .positional()
+            .then(|| PositionalEncoding::new(&(&root / "positional"), WIDTH, i64::from(spec.max_steps)));
         let actor = Head::new(&(&root / "actor"), memory.output_width(), distribution.width() as i64);
         let critic = Head::new(&(&root / "critic"), memory.output_width(), 1);
         let parameters = store.variables().into_iter().collect();
-        Ok(Self { store, parameters, encoder, projection, preprocessor, memory, actor, critic, distribution })
+        Ok(Self { store, parameters, encoder, projection, positional, preprocessor, memory, actor, critic, distribution })
     }
 
     /// Where the weights are.
@@ -162,34 +170,66 @@ impl Policy {
         weights::load_into(&self.parameters, bytes)
     }
 
-    /// The state at the start of an episode, for `rows` episodes.
+    /// The state at the start of an episode, for `rows` episodes: the memory's, and the time step (f32 `[rows]`) where there is a
+    /// positional encoding.
     pub fn initial_state(&self, rows: i64) -> State {
-        self.memory.initial_state(rows, self.device())
+        let mut state = self.memory.initial_state(rows, self.device());
+        state.0.extend(self.positional.as_ref().map(|_| Tensor::zeros([rows], (Kind::Float, self.device()))));
+        state
     }
 
     /// One time step without the critic: input vectors `[rows, input width]` to distribution parameters
     /// `[rows, parameters]` and the next state. No gradients.
     pub fn act(&self, features: &Tensor, state: &State) -> (Tensor, State) {
         tch::no_grad(|| {
-            let (output, state) = self.memory.step(&self.input(features), state);
+            let (output, state) = self.remember(features, state, |input, state| self.memory.act(input, state));
             (self.distribution.bound(self.actor.forward(&output)), state)
         })
     }
 
     /// One time step with the critic: as [`Policy::act`], and the values `[rows]`.
     pub fn step(&self, features: &Tensor, state: &State) -> (Tensor, Tensor, State) {
-        tch::no_grad(|| {
-            let (output, state) = self.memory.step(&self.input(features), state);
-            (self.distribution.bound(self.actor.forward(&output)), self.critic.forward(&output).squeeze_dim(1), state)
-        })
+        tch::no_grad(|| self.whole_step(features, state, |input, state| self.memory.act(input, state)))
+    }
+
+    /// [`Policy::step`] with gradients, and of libtorch's operators alone.
+    pub(crate) fn step_of_operators(&self, features: &Tensor, state: &State) -> (Tensor, Tensor, State) {
+        self.whole_step(features, state, |input, state| self.memory.step(input, state))
+    }
+
+    fn whole_step(
+        &self,
+        features: &Tensor,
+        state: &State,
+        memory: impl FnOnce(&Tensor, &State) -> (Tensor, State),
+    ) -> (Tensor, Tensor, State) {
+        let (output, state) = self.remember(features, state, memory);
+        (self.distribution.bound(self.actor.forward(&output)), self.critic.forward(&output).squeeze_dim(1), state)
+    }
+
+    /// The memory's output and the next state, by this form of the memory.
+    fn remember(
+        &self,
+        features: &Tensor,
+        state: &State,
+        memory: impl FnOnce(&Tensor, &State) -> (Tensor, State),
+    ) -> (Tensor, State) {
+        let Some((time, before)) = state.0.split_last().filter(|_| self.positional.is_some()) else {
+            return memory(&self.input(features, None), state);
+        };
+        let before = State(before.iter().map(Tensor::shallow_clone).collect());
+        let (output, mut next) = memory(&self.input(features, Some(time)), &before);
+        next.0.push(time + 1.0);
+        (output, next)
     }
 
     /// Whole episodes from their start: packed input vectors `[rows, input width]` to parameters and values.
     ///
     /// With `bptt` > 0 gradients are cut every `bptt` steps of an episode, while the state is carried.
     pub fn scan(&self, features: &Tensor, packing: &Packing, bptt: i64) -> Outputs {
-        let input = self.input(features);
-        let mut state = self.initial_state(packing.sequences());
+        let times = self.positional.as_ref().map(|_| packing.times(self.device()));
+        let input = self.input(features, times.as_ref());
+        let mut state = self.memory.initial_state(packing.sequences(), self.device());
         let (mut outputs, mut cuts, mut computed_steps) = (Vec::new(), Vec::new(), 0);
         for span in packing.spans(bptt) {
             let span_input = input.narrow(0, span.first_row, span.packing.rows());
@@ -215,11 +255,14 @@ impl Policy {
         }
     }
 
-    /// The memory's input: projected, normalised, preprocessed.
-    fn input(&self, features: &Tensor) -> Tensor {
+    /// The memory's input: projected, normalised, with its time step mixed in, preprocessed.
+    fn input(&self, features: &Tensor, times: Option<&Tensor>) -> Tensor {
         let projected = self.projection.forward(features);
-        let normalised = projected.layer_norm([WIDTH], None::<&Tensor>, None::<&Tensor>, 1e-5, false);
-        leaky_relu(&self.preprocessor.forward(&normalised))
+        let mut u = projected.layer_norm([WIDTH], None::<&Tensor>, None::<&Tensor>, 1e-5, false);
+        if let (Some(positional), Some(times)) = (&self.positional, times) {
+            u = positional.mix(&u, times);
+        }
+        leaky_relu(&self.preprocessor.forward(&u))
     }
 }
 

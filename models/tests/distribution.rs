@@ -182,6 +182,7 @@ fn log_standard_deviations_are_kept_within_bounds() {
             memory: "mlp".to_owned(),
             memory_options: toml::Table::new(),
             options: PolicyOptions { log_std_min: low, log_std_max: high },
+            max_steps: 10,
         };
         let policy = Policy::new(&spec, &memory::Registry::standard(), Device::Cpu).unwrap();
         // Logits, means, log standard deviations: what the head says at zero weights.
@@ -202,6 +203,7 @@ fn log_standard_deviations_are_kept_within_bounds() {
         memory: "mlp".to_owned(),
         memory_options: toml::Table::new(),
         options: PolicyOptions { log_std_min: min, log_std_max: max },
+        max_steps: 10,
     };
     for (min, max) in [(1.0, 0.0), (f64::NAN, 0.0), (0.0, f64::NAN)] {
         assert!(Policy::new(&spec(min, max), &memory::Registry::standard(), Device::Cpu).is_err());

@@ -1,26 +1,48 @@
-//! Memories against recordings of the upstream modules (fixtures/, or the file named by POPGYM_MEMORY_FIXTURES): outputs,
-//! gradients and final states.
+//! Memories against recordings of the upstream modules (fixtures/memories.json, or the file named by
+//! POPGYM_MEMORY_FIXTURES): outputs, gradients with respect to the input, and final states.
+//!
+//! The file: `cases`, each with `name`, `params` (upstream's names), `x [B, T, inputs]`, `y [B, T, outputs]`, `y_weight`,
+//! `grad_x` = d sum(y y_weight) / dx, and `final_state`; both rows have length T, states start at zero.
 
 mod common;
 
 use common::*;
-use popgym_models::Packing;
+use popgym_models::{Packing, State};
 use serde_json::Value;
 use tch::{Device, Kind, Tensor};
 
-type Case = (&'static str, &'static str, &'static [(&'static str, &'static str)]);
+/// How a recorded case is laid over a memory.
+struct Case {
+    /// The recorded case and our memory.
+    name: &'static str,
+    options: &'static str,
+    /// For each of upstream's parameters that matters ours; the numbers are in the same order.
+    parameters: &'static [(&'static str, &'static str)],
+    /// Weights of ours that the recorded module lacks: they hand on what they are given.
+    identities: &'static [&'static str],
+    /// The like biases.
+    zeros: &'static [&'static str],
+    /// From the recorded final state to ours, but for the tensors' shapes.
+    final_state: fn(Vec<Tensor>) -> Vec<Tensor>,
+}
 
-/// Memory (the recorded case has its name), its options, and for each of upstream's parameters ours.
-const CASES: [Case; 1] = [(
-    "gru",
-    "hidden_size = 8",
-    &[
+fn as_recorded(state: Vec<Tensor>) -> Vec<Tensor> {
+    state
+}
+
+const CASES: &[Case] = &[Case {
+    name: "gru",
+    options: "hidden_size = 8",
+    parameters: &[
         ("weight_ih_l0", "weight_input"),
         ("weight_hh_l0", "weight_state"),
         ("bias_ih_l0", "bias_input"),
         ("bias_hh_l0", "bias_state"),
     ],
-)];
+    identities: &[],
+    zeros: &[],
+    final_state: as_recorded,
+}];
 
 fn tensor(value: &Value) -> Tensor {
     fn walk(value: &Value, depth: usize, shape: &mut Vec<i64>, numbers: &mut Vec<f64>) {
@@ -55,40 +77,56 @@ fn packed(x: &Tensor) -> Tensor {
 fn memories_do_what_upstream_does() {
     let text = match std::env::var("POPGYM_MEMORY_FIXTURES") {
         Ok(path) => std::fs::read_to_string(path).expect("POPGYM_MEMORY_FIXTURES names a file"),
-        Err(_) => include_str!("fixtures/gru.json").to_owned(),
+        Err(_) => include_str!("fixtures/memories.json").to_owned(),
     };
     let file: Value = serde_json::from_str(&text).unwrap();
-    for (name, options, parameters) in CASES {
-        let case = file["cases"].as_array().unwrap().iter().find(|case| case["name"] == name);
-        let case = case.unwrap_or_else(|| panic!("no case {name}"));
-        let [x, y, y_weight, grad_x] = ["x", "y", "y_weight", "grad_x"].map(|key| tensor(&case[key]));
-        let [batch, steps, width] = x.size()[..] else { panic!() };
-        let (memory, variables) = memory(name, width, options);
-        assert_eq!(variables.len(), parameters.len());
-        for (theirs, ours) in parameters {
-            tch::no_grad(|| variables[*ours].shallow_clone().copy_(&tensor(&case["params"][theirs])));
+    for recorded in file["cases"].as_array().unwrap() {
+        let name = recorded["name"].as_str().unwrap();
+        let case = CASES.iter().find(|case| case.name == name);
+        replay(recorded, case.unwrap_or_else(|| panic!("no memory for the recorded case {name}")));
+        println!("{name}: outputs, gradients and final state match");
+    }
+}
+
+fn replay(recorded: &Value, case: &Case) {
+    let name = case.name;
+    let [x, y, y_weight, grad_x] = ["x", "y", "y_weight", "grad_x"].map(|key| tensor(&recorded[key]));
+    let [batch, steps, width] = x.size()[..] else { panic!() };
+    let (memory, variables) = memory(name, width, case.options);
+    assert_eq!(variables.len(), case.parameters.len() + case.identities.len() + case.zeros.len(), "{name}");
+    let set = |ours: &str, value: &Tensor| tch::no_grad(|| variables[ours].shallow_clone().copy_(value));
+    for (theirs, ours) in case.parameters {
+        set(ours, &tensor(&recorded["params"][theirs]).view_as(&variables[*ours]));
+    }
+    for ours in case.identities {
+        set(ours, &Tensor::eye(variables[*ours].size()[0], FLOAT));
+    }
+    for ours in case.zeros {
+        set(ours, &variables[*ours].zeros_like());
+    }
+    let final_state = (case.final_state)(recorded["final_state"].as_array().unwrap().iter().map(tensor).collect());
+    let assert_final = |state: &State| {
+        assert_eq!(state.0.len(), final_state.len());
+        for (i, (state, recorded)) in state.0.iter().zip(&final_state).enumerate() {
+            assert_recorded(state, &recorded.reshape(state.size()), &format!("{name}, final state {i}"));
         }
-        let final_state: Vec<Tensor> = case["final_state"].as_array().unwrap().iter().map(tensor).collect();
-        let assert_final = |state: &popgym_models::State| {
-            assert_eq!(state.0.len(), final_state.len());
-            for (state, recorded) in state.0.iter().zip(&final_state) {
-                assert_recorded(state, &recorded.view(&state.size()[..]), "final state");
-            }
-        };
+    };
 
-        let packing = Packing::new(&vec![steps; batch as usize]);
-        let initial = memory.initial_state(batch, Device::Cpu);
-        let scan = tch::no_grad(|| memory.scan(&packed(&x), &packing, &initial));
-        assert_recorded(&scan.output, &packed(&y), "scan");
-        assert_final(&scan.state);
-        let gradient = scan_gradient(&*memory, &packed(&x), &packing, &packed(&y_weight));
-        assert_recorded(&gradient, &packed(&grad_x), "gradient");
+    let packing = Packing::new(&vec![steps; batch as usize]);
+    let initial = memory.initial_state(batch, Device::Cpu);
+    let scan = tch::no_grad(|| memory.scan(&packed(&x), &packing, &initial));
+    assert_recorded(&scan.output, &packed(&y), &format!("{name}, scan"));
+    assert_final(&scan.state);
+    let gradient = scan_gradient(&*memory, &packed(&x), &packing, &packed(&y_weight));
+    assert_recorded(&gradient, &packed(&grad_x), &format!("{name}, gradient"));
 
-        let mut state = initial;
+    for acting in [false, true] {
+        let mut state = State(initial.0.iter().map(Tensor::copy).collect());
         for t in 0..steps {
-            let (output, next) = tch::no_grad(|| memory.step(&x.select(1, t), &state));
-            assert_recorded(&output, &y.select(1, t), "step");
-            state = next;
+            let x = x.select(1, t);
+            let (output, next) = if acting { memory.act(&x, &state) } else { memory.step(&x, &state) };
+            assert_recorded(&output.detach(), &y.select(1, t), &format!("{name}, step {t}, acting {acting}"));
+            state = State(next.0.iter().map(Tensor::detach).collect());
         }
         assert_final(&state);
     }

@@ -26,8 +26,13 @@ pub(super) fn floats_mut(tensor: &mut Tensor) -> &mut [f32] {
     unsafe { std::slice::from_raw_parts_mut(tensor.data_ptr().cast(), tensor.numel()) }
 }
 
+/// Whether the loops written for the CPU can take this tensor's numbers.
+pub(super) fn on_cpu(tensor: &Tensor) -> bool {
+    tensor.kind() == Kind::Float && tensor.device() == Device::Cpu
+}
+
 fn check(tensor: &Tensor) {
-    assert!(tensor.kind() == Kind::Float && tensor.device() == Device::Cpu && tensor.is_contiguous());
+    assert!(on_cpu(tensor) && tensor.is_contiguous());
 }
 
 /// Defines a function that runs `$body`, an `#[inline(always)]` function, compiled for the widest vectors that the machine

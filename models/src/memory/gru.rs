@@ -15,6 +15,7 @@
 use tch::nn::Path;
 use tch::{Device, Kind, Tensor};
 
+use super::elementwise::on_cpu;
 use super::{HiddenSize, Memory, MemoryKind, Scan, State, gru_cpu};
 use crate::init::uniform;
 use crate::packing::Packing;
@@ -32,6 +33,7 @@ pub struct Gru {
 impl MemoryKind for Gru {
     const NAME: &'static str = "gru";
     const PAPER_NAME: &'static str = "GRU";
+    const PAPER: &'static str = "Cho et al., 2014";
     type Options = HiddenSize;
 
     fn new(path: &Path<'_>, input_width: i64, options: &HiddenSize) -> Result<Self, String> {
@@ -64,19 +66,22 @@ impl Memory for Gru {
     }
 
     fn step(&self, input: &Tensor, state: &State) -> (Tensor, State) {
-        let state = &state.0[0];
-        let next = if input.device() == Device::Cpu {
-            gru_cpu::step(self.parameters(), input, state)
-        } else {
-            let [weight_input, weight_state, bias_input, bias_state] = self.parameters();
-            input.gru_cell(state, weight_input, weight_state, Some(bias_input), Some(bias_state))
-        };
+        let [weight_input, weight_state, bias_input, bias_state] = self.parameters();
+        let next = input.gru_cell(&state.0[0], weight_input, weight_state, Some(bias_input), Some(bias_state));
+        (next.shallow_clone(), State(vec![next]))
+    }
+
+    fn act(&self, input: &Tensor, state: &State) -> (Tensor, State) {
+        if !on_cpu(input) {
+            return tch::no_grad(|| self.step(input, state));
+        }
+        let next = gru_cpu::step(self.parameters(), input, &state.0[0]);
         (next.shallow_clone(), State(vec![next]))
     }
 
     fn scan(&self, input: &Tensor, packing: &Packing, state: &State) -> Scan {
         let state = &state.0[0];
-        if input.device() == Device::Cpu {
+        if on_cpu(input) {
             return gru_cpu::scan(self.parameters(), input, packing, state);
         }
         let (batch_sizes, initial) = (packing.batch_sizes_tensor(), state.unsqueeze(0));

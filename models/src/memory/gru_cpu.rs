@@ -57,7 +57,7 @@ pub(super) fn scan(parameters: Parameters<'_>, input: &Tensor, packing: &Packing
         let output = empty(packing.rows(), hidden);
         let mut before = initial.contiguous();
         let mut states = Vec::new();
-        for now in steps(packing) {
+        for now in packing.steps() {
             let alive = 0..now.len();
             let h = narrow(&before, &alive);
             let (mut a, mut next) = (narrow(&a, &now), narrow(&output, &now));
@@ -71,7 +71,7 @@ pub(super) fn scan(parameters: Parameters<'_>, input: &Tensor, packing: &Packing
         let backward = keep.then(|| {
             let tape = Tape {
                 parameters: parameters.map(Tensor::shallow_clone),
-                steps: steps(packing).collect(),
+                steps: packing.steps().collect(),
                 input: input.detach(),
                 h: Tensor::cat(&states, 0),
                 a,
@@ -122,15 +122,6 @@ impl Tape {
         add_gradients(&[w, u, b, c], &gradients);
         grad_input
     }
-}
-
-/// The packed rows of each time step.
-fn steps(packing: &Packing) -> impl Iterator<Item = Range<usize>> {
-    packing.batch_sizes().iter().scan(0, |start, &alive| {
-        let first = *start;
-        *start += alive as usize;
-        Some(first..*start)
-    })
 }
 
 fn narrow(tensor: &Tensor, rows: &Range<usize>) -> Tensor {

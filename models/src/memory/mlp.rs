@@ -20,6 +20,7 @@ pub struct Mlp {
 impl MemoryKind for Mlp {
     const NAME: &'static str = "mlp";
     const PAPER_NAME: &'static str = "MLP";
+    const PAPER: &'static str = "Morad et al., 2023";
     type Options = HiddenSize;
 
     fn new(path: &Path<'_>, input_width: i64, options: &HiddenSize) -> Result<Self, String> {

@@ -1,10 +1,12 @@
-//! Memories: the recurrent core of a policy, in two forms of one function.
+//! Memories: the recurrent core of a policy, as one function in three forms.
 //!
-//! - [`Memory::step`]: one time step for a batch of rows; what actors run;
+//! - [`Memory::step`]: one time step for a batch of rows, of libtorch's operators alone: the definition;
+//! - [`Memory::act`]: the same without gradients, as fast as the CPU can; what actors run;
 //! - [`Memory::scan`]: whole packed sequences, in the most parallel form the mathematics allows; what the learner runs.
 //!
-//! Both agree within `1e-5 max(1, largest |output|)`. To add a memory, copy `gru.rs` and add one line to
-//! [`Registry::standard`]; the tests of this crate then run on it without being told.
+//! They agree within `1e-5 max(1, largest |output|)`. Only `step` must be written; the others follow from it, slowly. To
+//! add a memory, copy `elman.rs` and add one line to [`Registry::standard`]; the tests of this crate then run on it
+//! without being told.
 
 use std::sync::Arc;
 
@@ -20,9 +22,11 @@ mod elementwise;
 mod gru;
 mod gru_cpu;
 mod mlp;
+mod pos_mlp;
 
 pub use gru::Gru;
 pub use mlp::Mlp;
+pub use pos_mlp::PosMlp;
 
 /// The recurrent state of a batch: tensors with one row a sequence (`[rows, ...]`).
 #[derive(Debug, Default)]
@@ -49,6 +53,11 @@ impl State {
                 .map(|tensor| tensor.index_select(0, &Tensor::from_slice(rows).to_device(tensor.device())))
                 .collect(),
         )
+    }
+
+    /// The state of `rows` rows from `start` on.
+    fn narrow(&self, start: i64, rows: i64) -> State {
+        State(self.0.iter().map(|tensor| tensor.narrow(0, start, rows)).collect())
     }
 
     /// The state's first `rows` rows, cut off from the graph that computed them.
@@ -81,12 +90,49 @@ pub trait Memory: Send {
     /// The state before the first step, all zeros, for `rows` sequences.
     fn initial_state(&self, rows: i64, device: Device) -> State;
 
-    /// One time step: `input [rows, input width]` to `output [rows, output width]` and the next state. For acting: no
-    /// gradients are promised.
+    /// Whether the policy adds a positional encoding to the input.
+    fn positional(&self) -> bool {
+        false
+    }
+
+    /// One time step: `input [rows, input width]` to `output [rows, output width]` and the next state. Made of libtorch's
+    /// operators alone, with no number of rows read, so that it can be differentiated, run in f64, and traced.
     fn step(&self, input: &Tensor, state: &State) -> (Tensor, State);
 
+    /// As [`Memory::step`], without gradients.
+    fn act(&self, input: &Tensor, state: &State) -> (Tensor, State) {
+        tch::no_grad(|| self.step(input, state))
+    }
+
     /// Whole sequences: packed `input [rows, input width]`; `state` before their first step, in packed order.
-    fn scan(&self, input: &Tensor, packing: &Packing, state: &State) -> Scan;
+    fn scan(&self, input: &Tensor, packing: &Packing, state: &State) -> Scan {
+        scan_by_steps(self, input, packing, state)
+    }
+}
+
+/// [`Memory::scan`] as a loop over [`Memory::step`], with autograd's gradients.
+pub fn scan_by_steps<M: Memory + ?Sized>(memory: &M, input: &Tensor, packing: &Packing, state: &State) -> Scan {
+    let mut state = State(state.0.iter().map(Tensor::shallow_clone).collect());
+    // States of sequences that have ended, the shortest first.
+    let mut ended: Vec<State> = Vec::new();
+    let mut outputs = Vec::new();
+    for now in packing.steps() {
+        let (alive, before) = (now.len() as i64, state.0.first().map_or(0, |tensor| tensor.size()[0]));
+        if alive < before {
+            ended.push(state.narrow(alive, before - alive));
+            state = state.narrow(0, alive);
+        }
+        let (output, next) = memory.step(&input.narrow(0, now.start as i64, alive), &state);
+        outputs.push(output);
+        state = next;
+    }
+    ended.push(state);
+    let last = (0..ended[0].0.len()).map(|i| {
+        let parts: Vec<&Tensor> = ended.iter().rev().map(|state| &state.0[i]).collect();
+        Tensor::cat(&parts, 0)
+    });
+    let state = State(last.collect());
+    Scan { output: Tensor::cat(&outputs, 0), state, computed_steps: packing.rows(), backward: None }
 }
 
 /// The options of a memory whose only one is its width.
@@ -107,8 +153,10 @@ impl Default for HiddenSize {
 pub trait MemoryKind: Memory + Sized + 'static {
     /// Its name in configurations, for example `gru`.
     const NAME: &'static str;
-    /// Its name in the paper's tables, for example `GRU`.
+    /// Its name in POPGym's tables, for example `GRU`.
     const PAPER_NAME: &'static str;
+    /// Where it comes from, for example `Cho et al., 2014`.
+    const PAPER: &'static str;
     /// Its options: the keys of the configuration's `[memory]` table beside `name`.
     type Options: Serialize + DeserializeOwned + Default;
 
@@ -127,8 +175,10 @@ type Resolve = dyn Fn(&toml::Table) -> Result<toml::Table, String> + Send + Sync
 pub struct Entry {
     /// Its name in configurations.
     pub name: &'static str,
-    /// Its name in the paper's tables.
+    /// Its name in POPGym's tables.
     pub paper_name: &'static str,
+    /// Where it comes from.
+    pub paper: &'static str,
     build: Arc<Build>,
     resolve: Arc<Resolve>,
 }
@@ -171,6 +221,7 @@ impl Registry {
     pub fn standard() -> Self {
         let mut registry = Self::default();
         registry.register::<Mlp>();
+        registry.register::<PosMlp>();
         registry.register::<Gru>();
         registry
     }
@@ -181,6 +232,7 @@ impl Registry {
         self.entries.push(Entry {
             name: M::NAME,
             paper_name: M::PAPER_NAME,
+            paper: M::PAPER,
             build: Arc::new(|path, input_width, options| {
                 M::new(path, input_width, &parse::<M>(options)?).map(|memory| Box::new(memory) as Box<dyn Memory>)
             }),

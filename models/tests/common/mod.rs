@@ -19,7 +19,7 @@ pub fn names() -> Vec<&'static str> {
 
 pub fn spec(memory: &str, observation: Space, action: Space) -> PolicySpec {
     let (memory, memory_options) = (memory.to_owned(), toml::Table::new());
-    PolicySpec { observation, action, memory, memory_options, options: UNBOUNDED }
+    PolicySpec { observation, action, memory, memory_options, options: UNBOUNDED, max_steps: 1024 }
 }
 
 pub fn policy(memory: &str, observation: Space, action: Space) -> Policy {
