@@ -12,7 +12,7 @@ use std::sync::Arc;
 
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
-use tch::nn::Path;
+use tch::nn::{Path, VarStore};
 use tch::{Device, Tensor};
 
 use crate::ModelError;
@@ -167,6 +167,15 @@ pub trait MemoryKind: Memory + Sized + 'static {
     fn new(path: &Path<'_>, input_width: i64, options: &Self::Options) -> Result<Self, String>;
 }
 
+/// How large a memory is.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Sizes {
+    /// Numbers that are learned.
+    pub parameters: usize,
+    /// Numbers that one sequence carries from step to step.
+    pub state: usize,
+}
+
 type Build = dyn Fn(&Path<'_>, i64, &toml::Table) -> Result<Box<dyn Memory>, String> + Send + Sync;
 type Resolve = dyn Fn(&toml::Table) -> Result<toml::Table, String> + Send + Sync;
 
@@ -203,6 +212,20 @@ impl Entry {
         options: &toml::Table,
     ) -> Result<Box<dyn Memory>, ModelError> {
         (self.build)(path, input_width, options).map_err(|problem| self.options_error(problem))
+    }
+
+    /// How large the memory is with these options.
+    ///
+    /// # Errors
+    /// The option that is wrong.
+    pub fn sizes(&self, input_width: i64, options: &toml::Table) -> Result<Sizes, ModelError> {
+        let store = VarStore::new(Device::Cpu);
+        let memory = self.build(&store.root(), input_width, options)?;
+        let numbers = |tensors: &[Tensor]| tensors.iter().map(Tensor::numel).sum();
+        Ok(Sizes {
+            parameters: numbers(&store.trainable_variables()),
+            state: numbers(&memory.initial_state(1, Device::Cpu).0),
+        })
     }
 
     fn options_error(&self, problem: String) -> ModelError {
