@@ -11,6 +11,7 @@
 //! | [`weights`] | weights as safetensors, every name and shape checked |
 //! | [`device`] | CPU and CUDA; the CUDA half of libtorch is opened only when asked for |
 
+mod chunks;
 pub mod device;
 pub mod distribution;
 pub mod encoder;

@@ -19,14 +19,24 @@ use crate::ModelError;
 use crate::packing::Packing;
 
 mod elementwise;
+mod fart;
+mod frame_stack;
+mod fwp;
 mod gru;
 mod gru_cpu;
+mod linear_attention;
 mod mlp;
 mod pos_mlp;
+mod tcn;
+mod windows;
 
+pub use fart::{Fart, FartOptions};
+pub use frame_stack::{FrameStack, FrameStackOptions};
+pub use fwp::{Fwp, FwpOptions};
 pub use gru::Gru;
 pub use mlp::Mlp;
 pub use pos_mlp::PosMlp;
+pub use tcn::{Tcn, TcnOptions};
 
 /// The recurrent state of a batch: tensors with one row a sequence (`[rows, ...]`).
 #[derive(Debug, Default)]
@@ -246,6 +256,10 @@ impl Registry {
         registry.register::<Mlp>();
         registry.register::<PosMlp>();
         registry.register::<Gru>();
+        registry.register::<Fart>();
+        registry.register::<Fwp>();
+        registry.register::<FrameStack>();
+        registry.register::<Tcn>();
         registry
     }
 
