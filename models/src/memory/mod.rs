@@ -18,12 +18,14 @@ use tch::{Device, Tensor};
 use crate::ModelError;
 use crate::packing::Packing;
 
+mod dnc;
 mod elementwise;
 mod gru;
 mod gru_cpu;
 mod mlp;
 mod pos_mlp;
 
+pub use dnc::{Dnc, DncOptions};
 pub use gru::Gru;
 pub use mlp::Mlp;
 pub use pos_mlp::PosMlp;
@@ -223,6 +225,7 @@ impl Registry {
         registry.register::<Mlp>();
         registry.register::<PosMlp>();
         registry.register::<Gru>();
+        registry.register::<Dnc>();
         registry
     }
 
