@@ -68,6 +68,23 @@ const CASES: &[Case] = &[
         zeros: &[],
         final_state: as_recorded,
     },
+    Case {
+        name: "dnc",
+        options: "hidden_size = 8\ncells = 3\ncell_size = 4\nread_heads = 2",
+        parameters: &[
+            ("lstm_layer_0.weight_ih_l0", "weight_input"),
+            ("lstm_layer_0.weight_hh_l0", "weight_state"),
+            ("lstm_layer_0.bias_ih_l0", "bias_input"),
+            ("lstm_layer_0.bias_hh_l0", "bias_state"),
+            ("rnn_layer_memory_shared.interface_weights.weight", "weight_interface"),
+            ("rnn_layer_memory_shared.interface_weights.bias", "bias_interface"),
+            ("output.weight", "weight_output"),
+            ("output.bias", "bias_output"),
+        ],
+        identities: &[],
+        zeros: &[],
+        final_state: as_recorded,
+    },
 ];
 
 /// The block of `fart` and `fwp`, but for the projection after it.

@@ -351,6 +351,7 @@ fn sizes_are_the_references() {
     let table = [
         ("mlp", 98_816, 0),
         ("gru", 296_448, 256),
+        ("dnc", 577_671, 1_200),
         ("fart", 12_527, 240),
         ("fwp", 13_360, 256),
         ("frame_stack", 139_840, 384),

@@ -18,6 +18,7 @@ use tch::{Device, Tensor};
 use crate::ModelError;
 use crate::packing::Packing;
 
+mod dnc;
 mod elementwise;
 mod fart;
 mod frame_stack;
@@ -33,6 +34,7 @@ mod windows;
 pub use fart::{Fart, FartOptions};
 pub use frame_stack::{FrameStack, FrameStackOptions};
 pub use fwp::{Fwp, FwpOptions};
+pub use dnc::{Dnc, DncOptions};
 pub use gru::Gru;
 pub use mlp::Mlp;
 pub use pos_mlp::PosMlp;
@@ -260,6 +262,7 @@ impl Registry {
         registry.register::<Fwp>();
         registry.register::<FrameStack>();
         registry.register::<Tcn>();
+        registry.register::<Dnc>();
         registry
     }
 
