@@ -30,19 +30,40 @@ fn as_recorded(state: Vec<Tensor>) -> Vec<Tensor> {
     state
 }
 
-const CASES: &[Case] = &[Case {
-    name: "gru",
-    options: "hidden_size = 8",
-    parameters: &[
-        ("weight_ih_l0", "weight_input"),
-        ("weight_hh_l0", "weight_state"),
-        ("bias_ih_l0", "bias_input"),
-        ("bias_hh_l0", "bias_state"),
-    ],
-    identities: &[],
-    zeros: &[],
-    final_state: as_recorded,
-}];
+/// PyTorch's names of a recurrent layer's parameters and ours.
+const RECURRENT: &[(&str, &str)] = &[
+    ("weight_ih_l0", "weight_input"),
+    ("weight_hh_l0", "weight_state"),
+    ("bias_ih_l0", "bias_input"),
+    ("bias_hh_l0", "bias_state"),
+];
+
+const CASES: &[Case] = &[
+    Case {
+        name: "elman",
+        options: "hidden_size = 8",
+        parameters: RECURRENT,
+        identities: &[],
+        zeros: &[],
+        final_state: as_recorded,
+    },
+    Case {
+        name: "lstm",
+        options: "hidden_size = 8",
+        parameters: RECURRENT,
+        identities: &[],
+        zeros: &[],
+        final_state: as_recorded,
+    },
+    Case {
+        name: "gru",
+        options: "hidden_size = 8",
+        parameters: RECURRENT,
+        identities: &[],
+        zeros: &[],
+        final_state: as_recorded,
+    },
+];
 
 fn tensor(value: &Value) -> Tensor {
     fn walk(value: &Value, depth: usize, shape: &mut Vec<i64>, numbers: &mut Vec<f64>) {

@@ -19,12 +19,19 @@ use crate::ModelError;
 use crate::packing::Packing;
 
 mod elementwise;
+mod elman;
+mod elman_cpu;
 mod gru;
 mod gru_cpu;
+mod lstm;
+mod lstm_cpu;
 mod mlp;
 mod pos_mlp;
+mod recurrent_cpu;
 
+pub use elman::Elman;
 pub use gru::Gru;
+pub use lstm::Lstm;
 pub use mlp::Mlp;
 pub use pos_mlp::PosMlp;
 
@@ -222,6 +229,8 @@ impl Registry {
         let mut registry = Self::default();
         registry.register::<Mlp>();
         registry.register::<PosMlp>();
+        registry.register::<Elman>();
+        registry.register::<Lstm>();
         registry.register::<Gru>();
         registry
     }
