@@ -30,15 +30,51 @@ fn as_recorded(state: Vec<Tensor>) -> Vec<Tensor> {
     state
 }
 
+/// PyTorch's names of a recurrent layer's parameters and ours.
+const RECURRENT: &[(&str, &str)] = &[
+    ("weight_ih_l0", "weight_input"),
+    ("weight_hh_l0", "weight_state"),
+    ("bias_ih_l0", "bias_input"),
+    ("bias_hh_l0", "bias_state"),
+];
+
 const CASES: &[Case] = &[
+    Case {
+        name: "elman",
+        options: "hidden_size = 8",
+        parameters: RECURRENT,
+        identities: &[],
+        zeros: &[],
+        final_state: as_recorded,
+    },
+    Case {
+        name: "lstm",
+        options: "hidden_size = 8",
+        parameters: RECURRENT,
+        identities: &[],
+        zeros: &[],
+        final_state: as_recorded,
+    },
     Case {
         name: "gru",
         options: "hidden_size = 8",
+        parameters: RECURRENT,
+        identities: &[],
+        zeros: &[],
+        final_state: as_recorded,
+    },
+    Case {
+        name: "dnc",
+        options: "hidden_size = 8\ncells = 3\ncell_size = 4\nread_heads = 2",
         parameters: &[
-            ("weight_ih_l0", "weight_input"),
-            ("weight_hh_l0", "weight_state"),
-            ("bias_ih_l0", "bias_input"),
-            ("bias_hh_l0", "bias_state"),
+            ("lstm_layer_0.weight_ih_l0", "weight_input"),
+            ("lstm_layer_0.weight_hh_l0", "weight_state"),
+            ("lstm_layer_0.bias_ih_l0", "bias_input"),
+            ("lstm_layer_0.bias_hh_l0", "bias_state"),
+            ("rnn_layer_memory_shared.interface_weights.weight", "weight_interface"),
+            ("rnn_layer_memory_shared.interface_weights.bias", "bias_interface"),
+            ("output.weight", "weight_output"),
+            ("output.bias", "bias_output"),
         ],
         identities: &[],
         zeros: &[],
@@ -64,23 +100,6 @@ const CASES: &[Case] = &[
         name: "tcn",
         options: "hidden_size = 8",
         parameters: &[("weight", "weight"), ("bias", "bias")],
-        identities: &[],
-        zeros: &[],
-        final_state: as_recorded,
-    },
-    Case {
-        name: "dnc",
-        options: "hidden_size = 8\ncells = 3\ncell_size = 4\nread_heads = 2",
-        parameters: &[
-            ("lstm_layer_0.weight_ih_l0", "weight_input"),
-            ("lstm_layer_0.weight_hh_l0", "weight_state"),
-            ("lstm_layer_0.bias_ih_l0", "bias_input"),
-            ("lstm_layer_0.bias_hh_l0", "bias_state"),
-            ("rnn_layer_memory_shared.interface_weights.weight", "weight_interface"),
-            ("rnn_layer_memory_shared.interface_weights.bias", "bias_interface"),
-            ("output.weight", "weight_output"),
-            ("output.bias", "bias_output"),
-        ],
         identities: &[],
         zeros: &[],
         final_state: as_recorded,

@@ -350,6 +350,9 @@ fn sizes_are_the_references() {
     // Reference 4.2: weights, and floats of state, for input 128 and hidden 256.
     let table = [
         ("mlp", 98_816, 0),
+        ("pos_mlp", 98_816, 0),
+        ("elman", 98_816, 256),
+        ("lstm", 395_264, 512),
         ("gru", 296_448, 256),
         ("dnc", 577_671, 1_200),
         ("fart", 12_527, 240),

@@ -20,22 +20,29 @@ use crate::packing::Packing;
 
 mod dnc;
 mod elementwise;
+mod elman;
+mod elman_cpu;
 mod fart;
 mod frame_stack;
 mod fwp;
 mod gru;
 mod gru_cpu;
 mod linear_attention;
+mod lstm;
+mod lstm_cpu;
 mod mlp;
 mod pos_mlp;
+mod recurrent_cpu;
 mod tcn;
 mod windows;
 
+pub use dnc::{Dnc, DncOptions};
+pub use elman::Elman;
 pub use fart::{Fart, FartOptions};
 pub use frame_stack::{FrameStack, FrameStackOptions};
 pub use fwp::{Fwp, FwpOptions};
-pub use dnc::{Dnc, DncOptions};
 pub use gru::Gru;
+pub use lstm::Lstm;
 pub use mlp::Mlp;
 pub use pos_mlp::PosMlp;
 pub use tcn::{Tcn, TcnOptions};
@@ -257,12 +264,14 @@ impl Registry {
         let mut registry = Self::default();
         registry.register::<Mlp>();
         registry.register::<PosMlp>();
+        registry.register::<Elman>();
+        registry.register::<Lstm>();
         registry.register::<Gru>();
+        registry.register::<Dnc>();
         registry.register::<Fart>();
         registry.register::<Fwp>();
         registry.register::<FrameStack>();
         registry.register::<Tcn>();
-        registry.register::<Dnc>();
         registry
     }
 
