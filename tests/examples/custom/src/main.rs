@@ -1,7 +1,9 @@
-//! A trainer with an environment of one's own: `custom train --env TMaze`, and every other command of `learner`.
+//! A trainer with an environment and a memory of one's own: `custom train --env TMaze --memory decay`, and every other
+//! command of `learner`.
 //!
-//! One program is both: called as `custom actor ...` it is an actor that knows the same environments.
+//! One program is both: called as `custom actor ...` it is an actor that knows the same environments and memories.
 
+mod decay;
 mod t_maze;
 
 use std::ffi::OsString;
@@ -21,11 +23,13 @@ fn main() -> ExitCode {
             return ExitCode::FAILURE;
         }
     }
+    let mut memories = popgym_models::memory::Registry::standard();
+    memories.register::<decay::Decay>();
     let mut arguments: Vec<OsString> = std::env::args_os().collect();
     if arguments.get(1).is_some_and(|first| first == "actor") {
         arguments.remove(1);
-        return popgym_actor::run(envs, popgym_models::memory::Registry::standard(), arguments);
+        return popgym_actor::run(envs, memories, arguments);
     }
     let actor_command = vec![THIS_PROGRAM.to_owned(), "actor".to_owned()];
-    popgym_learner::run(Extensions { envs, actor_command, ..Extensions::default() }, arguments)
+    popgym_learner::run(Extensions { envs, memories, actor_command, ..Extensions::default() }, arguments)
 }

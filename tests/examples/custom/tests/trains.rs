@@ -11,33 +11,25 @@ fn custom(scene: &Scene, args: &[&str]) -> Process {
 }
 
 /// Always walking on and then guessing returns 0 on average. With a memory the sign is found out.
+fn learns(memory: &str) {
+    let scene = Scene::new();
+    let flags = "train --config tiny.toml --env TMaze --out run --steps 400000 --passes 4 --batch-steps 2048 \
+                 --stop-at-mmer 0.9 --memory";
+    let flags: Vec<&str> = flags.split_whitespace().chain([memory]).collect();
+    custom(&scene, &flags).expect(0);
+    let summary = scene.json("run/summary.json");
+    assert_eq!((summary["env"].as_str(), summary["memory"].as_str()), (Some("TMaze"), Some(memory)));
+    assert!(summary["mmer"].as_f64().unwrap() >= 0.9, "{summary}");
+}
+
 #[test]
 fn an_environment_of_ones_own_is_learned() {
-    let scene = Scene::new();
-    custom(
-        &scene,
-        &[
-            "train",
-            "--config",
-            "tiny.toml",
-            "--env",
-            "TMaze",
-            "--out",
-            "run",
-            "--steps",
-            "400000",
-            "--passes",
-            "4",
-            "--batch-steps",
-            "2048",
-            "--stop-at-mmer",
-            "0.9",
-        ],
-    )
-    .expect(0);
-    let summary = scene.json("run/summary.json");
-    assert_eq!(summary["env"], "TMaze");
-    assert!(summary["mmer"].as_f64().unwrap() >= 0.9, "{summary}");
+    learns("gru");
+}
+
+#[test]
+fn a_memory_of_ones_own_learns() {
+    learns("decay");
 }
 
 #[test]
@@ -45,6 +37,8 @@ fn its_names_stand_beside_the_others() {
     let scene = Scene::new();
     let listed = custom(&scene, &["list", "envs"]).expect(0).stdout;
     assert!(listed.contains("TMaze50") && listed.contains("RepeatPreviousEasy"), "{listed}");
+    let listed = custom(&scene, &["list", "memories"]).expect(0).stdout;
+    assert!(listed.contains("decay") && listed.contains("gru"), "{listed}");
     let unknown = custom(&scene, &["train", "--env", "TMaz"]).expect(2).stderr;
     assert!(unknown.contains("did you mean `TMaze`"), "{unknown}");
 }
