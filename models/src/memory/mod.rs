@@ -27,6 +27,7 @@ mod gru_cpu;
 mod linear_attention;
 mod mlp;
 mod pos_mlp;
+mod s4d;
 mod tcn;
 mod windows;
 
@@ -36,6 +37,7 @@ pub use fwp::{Fwp, FwpOptions};
 pub use gru::Gru;
 pub use mlp::Mlp;
 pub use pos_mlp::PosMlp;
+pub use s4d::{S4d, S4dOptions};
 pub use tcn::{Tcn, TcnOptions};
 
 /// The recurrent state of a batch: tensors with one row a sequence (`[rows, ...]`).
@@ -237,6 +239,7 @@ impl Registry {
         registry.register::<Fwp>();
         registry.register::<FrameStack>();
         registry.register::<Tcn>();
+        registry.register::<S4d>();
         registry
     }
 
