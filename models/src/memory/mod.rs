@@ -28,6 +28,7 @@ mod linear_attention;
 mod mlp;
 mod pos_mlp;
 mod s4d;
+mod s4d_cpu;
 mod tcn;
 mod windows;
 

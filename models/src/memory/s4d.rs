@@ -30,7 +30,8 @@ use serde::{Deserialize, Serialize};
 use tch::nn::{Init, Path};
 use tch::{Device, Kind, Tensor};
 
-use super::{Memory, MemoryKind, Scan, State};
+use super::elementwise::on_cpu;
+use super::{Memory, MemoryKind, Scan, State, s4d_cpu};
 use crate::chunks::Chunks;
 use crate::init::{Linear, uniform};
 use crate::packing::Packing;
@@ -240,6 +241,20 @@ impl Memory for S4d {
         (self.finish(&(seen * 2.0 + u * &self.skip)), State(vec![next.re, next.im]))
     }
 
+    fn act(&self, input: &Tensor, state: &State) -> (Tensor, State) {
+        tch::no_grad(|| {
+            if !on_cpu(input) || self.modes != s4d_cpu::MODES as i64 {
+                return self.step(input, state);
+            }
+            let (a, b) = self.discretise();
+            let c = Complex::of_pairs(&self.state_output);
+            let system = [[&a.re, &a.im], [&b.re, &b.im], [&c.re, &c.im]];
+            let u = self.input.forward(input);
+            let (v, next) = s4d_cpu::step(&u, [&state.0[0], &state.0[1]], system, &self.skip);
+            (self.finish(&v), State(next.into()))
+        })
+    }
+
     fn scan(&self, input: &Tensor, packing: &Packing, state: &State) -> Scan {
         let chunks = Chunks::new(packing, CHUNK, input.device());
         let system = self.chunk_system(chunks.size());
@@ -249,9 +264,10 @@ impl Memory for S4d {
 
         let initial = Tensor::cat(&[&state.0[0], &state.0[1]], 2).transpose(0, 1);
         let whole = system.powers.map(|part| part.select(2, chunks.size()).unsqueeze(1));
-        let added = u.bmm(&system.to_state);
+        let driven = u.bmm(&Tensor::cat(&[&system.convolution, &system.to_state], 2));
+        let [v, added] = driven.split_with_sizes([chunks.size(), 2 * self.modes], 2).try_into().expect("two parts");
         let before = chunks.carry(&initial, &added, 1, |state, added| decay(state, &whole) + added);
-        let v = u.bmm(&system.convolution).baddbmm(&before, &system.from_state, 1.0, 1.0);
+        let v = v.baddbmm(&before, &system.from_state, 1.0, 1.0);
         let v = chunks.join(&v.view([self.hidden_size, -1]).tr().contiguous());
 
         let last = tch::no_grad(|| {
