@@ -3,7 +3,7 @@
 //! Chunks stand in the order of time: first the first chunks of all sequences, then the second chunks of those that are
 //! long enough, and so on, each group in packed order. Only the last chunk of a sequence may be padded, with zeros at its end.
 
-use tch::{Device, Tensor};
+use tch::{Device, Kind, Tensor};
 
 use crate::packing::Packing;
 
@@ -14,9 +14,9 @@ pub(crate) struct Chunks {
     /// Number of chunks at each place in time, falling.
     alive: Vec<i64>,
     /// Steps in the last chunk of each sequence, in packed order.
-    last_lengths: Vec<i64>,
+    last_lengths: Tensor,
     /// The chunk that is each sequence's last.
-    last: Vec<i64>,
+    last: Tensor,
     /// For each step of each chunk its packed row; a row past the end for padding.
     cut: Tensor,
     /// For each packed row its step in the chunks.
@@ -47,9 +47,9 @@ impl Chunks {
             let place_in_time = (length - 1) / size;
             alive[..place_in_time as usize].iter().sum::<i64>() + place
         });
-        let last = last.collect();
-        let last_lengths = lengths.iter().map(|length| (length - 1) % size + 1).collect();
+        let last_lengths = lengths.iter().map(|length| (length - 1) % size + 1);
         let index = |rows: &[i64]| Tensor::from_slice(rows).to_device(device);
+        let (last, last_lengths) = (index(&last.collect::<Vec<_>>()), index(&last_lengths.collect::<Vec<_>>()));
         Self { size, last_lengths, last, cut: index(&cut), join: index(&join), alive }
     }
 
@@ -69,33 +69,44 @@ impl Chunks {
         with_zero_row(x).index_select(0, &self.cut).view([-1, self.size, width])
     }
 
-    /// Chunks `[chunks, size, width]` to packed rows `[rows, width]`.
+    /// Steps of chunks, `[chunks size, width]`, to packed rows `[rows, width]`.
     pub(crate) fn join(&self, chunks: &Tensor) -> Tensor {
-        chunks.reshape([-1, chunks.size()[2]]).index_select(0, &self.join)
+        chunks.index_select(0, &self.join)
     }
 
-    /// Carries a state from chunk to chunk: `initial` (sequences along `dim`) and what each chunk adds (chunks along `dim`)
-    /// to the state before each chunk, and the state after each sequence's last one. `next` is the state after a chunk.
+    /// The last chunk of each sequence, as [`Chunks::cut`], with the padding before the steps: `[sequences, size, width]`.
+    pub(crate) fn cut_last(&self, x: &Tensor) -> Tensor {
+        let cut = self.cut.view([-1, self.size]).index_select(0, &self.last);
+        let steps = Tensor::arange(self.size, (Kind::Int64, x.device())) + self.last_lengths.unsqueeze(1);
+        let cut = cut.gather(1, &steps.remainder(self.size), false);
+        with_zero_row(x).index_select(0, &cut.view(-1)).view([-1, self.size, x.size()[1]])
+    }
+
+    /// Of one entry a chunk along `dim`, those of the last chunk of each sequence, in packed order.
+    pub(crate) fn last(&self, x: &Tensor, dim: i64) -> Tensor {
+        x.index_select(dim, &self.last)
+    }
+
+    /// Number of steps in the last chunk of each sequence, `[sequences]`.
+    pub(crate) fn last_lengths(&self) -> &Tensor {
+        &self.last_lengths
+    }
+
+    /// Carries a state from chunk to chunk: from `initial` (sequences along `dim`) and what each chunk adds (chunks along
+    /// `dim`) to the state before each chunk. `next` makes the state after a chunk of the one before and of what it adds.
     pub(crate) fn carry(
         &self,
         initial: &Tensor,
         added: &Tensor,
         dim: i64,
         next: impl Fn(&Tensor, &Tensor) -> Tensor,
-    ) -> (Tensor, Tensor) {
-        let mut before = Vec::new();
-        let mut after = Vec::new();
-        let mut state = initial.shallow_clone();
-        for (&alive, added) in self.alive.iter().zip(added.split_with_sizes(&self.alive[..], dim)) {
-            if !before.is_empty() {
-                state = state.narrow(dim, 0, alive);
-            }
-            before.push(state.shallow_clone());
-            state = next(&state, &added);
-            after.push(state.shallow_clone());
+    ) -> Tensor {
+        let mut before = vec![initial.shallow_clone()];
+        for (alive, added) in self.alive[1..].iter().zip(added.split_with_sizes(&self.alive[..], dim)) {
+            let state = before[before.len() - 1].narrow(dim, 0, *alive);
+            before.push(next(&state, &added.narrow(dim, 0, *alive)));
         }
-        let last = Tensor::from_slice(&self.last).to_device(initial.device());
-        (Tensor::cat(&before, dim), Tensor::cat(&after, dim).index_select(dim, &last))
+        Tensor::cat(&before, dim)
     }
 }
 

@@ -104,6 +104,23 @@ const CASES: &[Case] = &[
         zeros: &[],
         final_state: as_recorded,
     },
+    Case {
+        name: "s4d",
+        options: "hidden_size = 8\nstate_size = 4",
+        parameters: &[
+            ("D", "skip"),
+            ("kernel.kernel.inv_A_real", "log_decay"),
+            ("kernel.kernel.A_imag", "frequency"),
+            ("kernel.kernel.B", "state_input"),
+            ("kernel.kernel.C", "state_output"),
+            ("kernel.kernel.log_dt", "log_step"),
+            ("output_linear.0.weight", "output.weight"),
+            ("output_linear.0.bias", "output.bias"),
+        ],
+        identities: &["input.weight"],
+        zeros: &["input.bias"],
+        final_state: as_recorded,
+    },
 ];
 
 /// The block of `fart` and `fwp`, but for the projection after it.
@@ -181,7 +198,11 @@ fn replay(recorded: &Value, case: &Case) {
     for ours in case.zeros {
         set(ours, &variables[*ours].zeros_like());
     }
-    let final_state = (case.final_state)(recorded["final_state"].as_array().unwrap().iter().map(tensor).collect());
+    let tensors = recorded["final_state"].as_array().unwrap().iter().flat_map(|recorded| match recorded.get("real") {
+        Some(real) => vec![tensor(real), tensor(&recorded["imag"])],
+        None => vec![tensor(recorded)],
+    });
+    let final_state = (case.final_state)(tensors.collect());
     let assert_final = |state: &State| {
         assert_eq!(state.0.len(), final_state.len());
         for (i, (state, recorded)) in state.0.iter().zip(&final_state).enumerate() {

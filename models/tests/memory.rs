@@ -359,6 +359,7 @@ fn sizes_are_the_references() {
         ("fwp", 13_360, 256),
         ("frame_stack", 139_840, 384),
         ("tcn", 131_328, 384),
+        ("s4d", 177_408, 4096),
     ];
     for (name, weights, state) in table {
         let (memory, parameters) = memory(name, WIDTH, "");

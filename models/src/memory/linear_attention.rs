@@ -85,8 +85,9 @@ pub(super) fn scan(q: &Tensor, k: &Tensor, v: &Tensor, packing: &Packing, sums: 
     let parts = chunks.cut(&Tensor::cat(&[q, k, v], 1)).split_with_sizes([keys, keys, values], 2);
     let [q, k, v] = &parts[..] else { unreachable!("three sizes were asked for") };
     let added = k.transpose(1, 2).bmm(v);
-    let (before, after) = chunks.carry(sums, &added, 0, |sums, added| sums + added);
+    let before = chunks.carry(sums, &added, 0, |sums, added| sums + added);
+    let after = chunks.last(&(&before + &added), 0);
     let scores = q.bmm(&k.transpose(1, 2)).tril(0);
     let o = scores.bmm(v).baddbmm(q, &before, 1.0, 1.0);
-    (chunks.join(&o), after, chunks.rows())
+    (chunks.join(&o.view([-1, values])), after, chunks.rows())
 }

@@ -33,6 +33,8 @@ mod lstm_cpu;
 mod mlp;
 mod pos_mlp;
 mod recurrent_cpu;
+mod s4d;
+mod s4d_cpu;
 mod tcn;
 mod windows;
 
@@ -45,6 +47,7 @@ pub use gru::Gru;
 pub use lstm::Lstm;
 pub use mlp::Mlp;
 pub use pos_mlp::PosMlp;
+pub use s4d::{S4d, S4dOptions};
 pub use tcn::{Tcn, TcnOptions};
 
 /// The recurrent state of a batch: tensors with one row a sequence (`[rows, ...]`).
@@ -272,6 +275,7 @@ impl Registry {
         registry.register::<Fwp>();
         registry.register::<FrameStack>();
         registry.register::<Tcn>();
+        registry.register::<S4d>();
         registry
     }
 
