@@ -262,7 +262,13 @@ fn a_state_is_reset_and_selected_by_rows() {
 #[test]
 fn sizes_are_the_references() {
     // Reference 4.2: weights, and floats of state, for input 128 and hidden 256.
-    let table = [("mlp", 98_816, 0), ("elman", 98_816, 256), ("lstm", 395_264, 512), ("gru", 296_448, 256)];
+    let table = [
+        ("mlp", 98_816, 0),
+        ("elman", 98_816, 256),
+        ("lstm", 395_264, 512),
+        ("gru", 296_448, 256),
+        ("indrnn", 99_840, 512),
+    ];
     for (name, weights, state) in table {
         let (memory, parameters) = memory(name, WIDTH, "");
         assert_eq!(parameters.values().map(Tensor::numel).sum::<usize>(), weights, "{name}");

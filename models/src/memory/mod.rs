@@ -23,14 +23,21 @@ mod elman;
 mod elman_cpu;
 mod gru;
 mod gru_cpu;
+mod indrnn;
+mod indrnn_cpu;
+mod lmu;
+mod lmu_cpu;
 mod lstm;
 mod lstm_cpu;
 mod mlp;
 mod pos_mlp;
 mod recurrent_cpu;
+mod trajectory;
 
 pub use elman::Elman;
 pub use gru::Gru;
+pub use indrnn::IndRnn;
+pub use lmu::{Lmu, LmuOptions, sliding_window};
 pub use lstm::Lstm;
 pub use mlp::Mlp;
 pub use pos_mlp::PosMlp;
@@ -232,6 +239,8 @@ impl Registry {
         registry.register::<Elman>();
         registry.register::<Lstm>();
         registry.register::<Gru>();
+        registry.register::<IndRnn>();
+        registry.register::<Lmu>();
         registry
     }
 
