@@ -167,7 +167,9 @@ impl Memory for Lmu {
         let p = &self.parameters;
         let (h, m) = (&state.0[0], &state.0[1]);
         let [window, window_input] = [&p.window, &p.window_input].map(|x| x.to_kind(input.kind()));
-        let u = input.mm(&p.encoder_input.tr()).addmm(h, &p.encoder_state.tr()).addmm(m, &p.encoder_memory.tr());
+        // Not as products with one column, whose bits would depend on the number of rows.
+        let dot = |x: &Tensor, e: &Tensor| (x * e).sum_dim_intlist(1, true, None::<Kind>);
+        let u = dot(input, &p.encoder_input) + dot(h, &p.encoder_state) + dot(m, &p.encoder_memory);
         let m = m.mm(&window.tr()).addmm(&u, &window_input);
         let h = input.mm(&p.weight_input.tr()).addmm(h, &p.weight_state.tr()).addmm(&m, &p.weight_memory.tr()).tanh();
         (h.shallow_clone(), State(vec![h, m]))

@@ -115,7 +115,8 @@ pub(super) fn scan<C: Cell>(parameters: Parameters<'_>, input: &Tensor, packing:
         let [w, u, b, c] = parameters;
         let hidden = u.size()[1] as usize;
         let gates = C::GATES * hidden;
-        let transposed = u.tr();
+        // Small products are faster on a copy. The GRU's have been without, and keep their bits.
+        let transposed = if C::TWO_PARTS { u.tr() } else { u.tr().contiguous() };
         let mut a = b.addmm(input, &w.tr());
         let kept_s = keep && C::TWO_PARTS;
         let mut s = empty(if kept_s { packing.rows() } else { packing.sequences() }, gates);
