@@ -64,6 +64,24 @@ const CASES: &[Case] = &[
         final_state: as_recorded,
     },
     Case {
+        name: "indrnn",
+        options: "hidden_size = 8",
+        parameters: &[
+            ("input0.weight", "weight_input"),
+            ("input0.bias", "first_bias_input"),
+            ("weight0", "first_recurrent"),
+            ("bias0", "first_bias_state"),
+            ("input1.weight", "weight_between"),
+            ("input1.bias", "second_bias_input"),
+            ("weight1", "second_recurrent"),
+            ("bias1", "second_bias_state"),
+        ],
+        identities: &[],
+        zeros: &[],
+        // [rows, 2, hidden]: both layers in one tensor.
+        final_state: |state| state[0].unbind(1),
+    },
+    Case {
         name: "dnc",
         options: "hidden_size = 8\ncells = 3\ncell_size = 4\nread_heads = 2",
         parameters: &[
@@ -100,6 +118,21 @@ const CASES: &[Case] = &[
         name: "tcn",
         options: "hidden_size = 8",
         parameters: &[("weight", "weight"), ("bias", "bias")],
+        identities: &[],
+        zeros: &[],
+        final_state: as_recorded,
+    },
+    Case {
+        name: "lmu",
+        options: "hidden_size = 8\nmemory_size = 7\ntheta = 16",
+        parameters: &[
+            ("cell.e_x", "encoder_input"),
+            ("cell.e_h", "encoder_state"),
+            ("cell.e_m", "encoder_memory"),
+            ("cell.W_x", "weight_input"),
+            ("cell.W_h", "weight_state"),
+            ("cell.W_m", "weight_memory"),
+        ],
         identities: &[],
         zeros: &[],
         final_state: as_recorded,

@@ -354,13 +354,16 @@ fn sizes_are_the_references() {
         ("elman", 98_816, 256),
         ("lstm", 395_264, 512),
         ("gru", 296_448, 256),
+        ("indrnn", 99_840, 512),
         ("dnc", 577_671, 1_200),
         ("fart", 12_527, 240),
         ("fwp", 13_360, 256),
         ("frame_stack", 139_840, 384),
         ("tcn", 131_328, 384),
-        ("s4d", 177_408, 4096),
+        ("lmu", 164_480, 512),
+        ("s4d", 177_408, 4_096),
     ];
+    assert_eq!(table.map(|(name, ..)| name)[..], names());
     for (name, weights, state) in table {
         let (memory, parameters) = memory(name, WIDTH, "");
         assert_eq!(parameters.values().map(Tensor::numel).sum::<usize>(), weights, "{name}");

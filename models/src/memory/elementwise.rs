@@ -105,6 +105,12 @@ fn exp(x: f32) -> f32 {
     exp_r * f32::from_bits((shifted.to_bits() << 23).wrapping_add(0x3f80_0000))
 }
 
+/// Numbers within +-5 to test loops with.
+#[cfg(test)]
+pub(super) fn numbers(n: usize, seed: usize) -> Vec<f32> {
+    (0..n).map(|i| ((i * 7919 + seed * 104_729) % 10_007) as f32 / 1_000.0 - 5.0).collect()
+}
+
 #[cfg(test)]
 mod tests {
     use super::{exp, sigmoid, tanh};

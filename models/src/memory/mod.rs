@@ -27,7 +27,11 @@ mod frame_stack;
 mod fwp;
 mod gru;
 mod gru_cpu;
+mod indrnn;
+mod indrnn_cpu;
 mod linear_attention;
+mod lmu;
+mod lmu_cpu;
 mod lstm;
 mod lstm_cpu;
 mod mlp;
@@ -36,6 +40,7 @@ mod recurrent_cpu;
 mod s4d;
 mod s4d_cpu;
 mod tcn;
+mod trajectory;
 mod windows;
 
 pub use dnc::{Dnc, DncOptions};
@@ -44,6 +49,8 @@ pub use fart::{Fart, FartOptions};
 pub use frame_stack::{FrameStack, FrameStackOptions};
 pub use fwp::{Fwp, FwpOptions};
 pub use gru::Gru;
+pub use indrnn::IndRnn;
+pub use lmu::{Lmu, LmuOptions, sliding_window};
 pub use lstm::Lstm;
 pub use mlp::Mlp;
 pub use pos_mlp::PosMlp;
@@ -270,11 +277,13 @@ impl Registry {
         registry.register::<Elman>();
         registry.register::<Lstm>();
         registry.register::<Gru>();
+        registry.register::<IndRnn>();
         registry.register::<Dnc>();
         registry.register::<Fart>();
         registry.register::<Fwp>();
         registry.register::<FrameStack>();
         registry.register::<Tcn>();
+        registry.register::<Lmu>();
         registry.register::<S4d>();
         registry
     }

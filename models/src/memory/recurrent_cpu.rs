@@ -19,6 +19,7 @@ use std::ops::Range;
 use tch::{Device, Kind, Tensor};
 
 use super::elementwise::{floats, floats_mut, widest};
+use super::trajectory::{Step, Trajectory, empty, narrow};
 use super::{Scan, State, add_gradients};
 use crate::packing::Packing;
 
@@ -114,7 +115,8 @@ pub(super) fn scan<C: Cell>(parameters: Parameters<'_>, input: &Tensor, packing:
         let [w, u, b, c] = parameters;
         let hidden = u.size()[1] as usize;
         let gates = C::GATES * hidden;
-        let transposed = u.tr();
+        // Small products are faster on a copy. The GRU's have been without, and keep their bits.
+        let transposed = if C::TWO_PARTS { u.tr() } else { u.tr().contiguous() };
         let mut a = b.addmm(input, &w.tr());
         let kept_s = keep && C::TWO_PARTS;
         let mut s = empty(if kept_s { packing.rows() } else { packing.sequences() }, gates);
@@ -124,8 +126,8 @@ pub(super) fn scan<C: Cell>(parameters: Parameters<'_>, input: &Tensor, packing:
         for step in &steps {
             let s_rows = if kept_s { step.now.clone() } else { 0..step.now.len() };
             let _ = h.before(step).mm_out(&narrow(&s, &s_rows), &transposed);
-            let (h, next_h) = h.slices(step, hidden);
-            let (cell, next_cell) = cell.as_mut().map_or((&[][..], &mut [][..]), |cell| cell.slices(step, hidden));
+            let (h, next_h) = h.slices(step);
+            let (cell, next_cell) = cell.as_mut().map_or((&[][..], &mut [][..]), |cell| cell.slices(step));
             let (a, s) = (rows_mut(&mut a, &step.now, gates), rows_mut(&mut s, &s_rows, gates));
             forward::<C>(Forward { hidden, a, s, c: floats(c), h, cell, next_h, next_cell });
         }
@@ -170,12 +172,11 @@ impl<C: Cell> Tape<C> {
         let (gradients, grad_input) = tch::no_grad(|| {
             self.backward_in_time(&grad_output.contiguous());
             let (da, ds) = (&self.a, if C::TWO_PARTS { &self.s } else { &self.a });
-            let h: Vec<Tensor> = self.steps.iter().map(|step| self.h.before(step)).collect();
             let sum = |x: &Tensor| x.sum_dim_intlist(0, false, Kind::Float);
             let sum_da = sum(da);
             let sum_ds = if C::TWO_PARTS { sum(ds) } else { sum_da.shallow_clone() };
             let grad_input = da.mm(&self.parameters[0]);
-            ([da.tr().mm(&self.input), ds.tr().mm(&Tensor::cat(&h, 0)), sum_da, sum_ds], grad_input)
+            ([da.tr().mm(&self.input), ds.tr().mm(&self.h.all_before(&self.steps)), sum_da, sum_ds], grad_input)
         });
         add_gradients(&self.parameters.each_ref(), &gradients);
         grad_input
@@ -193,8 +194,8 @@ impl<C: Cell> Tape<C> {
         for step in self.steps.iter().rev() {
             let alive = 0..step.now.len();
             let s_rows = if C::TWO_PARTS { &step.now } else { &alive };
-            let (h, next_h) = self.h.slices(step, hidden);
-            let cell = self.cell.as_mut().map_or(&[][..], |cell| cell.slices(step, hidden).0);
+            let (h, next_h) = self.h.slices(step);
+            let cell = self.cell.as_mut().map_or(&[][..], |cell| cell.slices(step).0);
             backward::<C>(Backward {
                 hidden,
                 a: rows_mut(&mut self.a, &step.now, gates),
@@ -214,66 +215,84 @@ impl<C: Cell> Tape<C> {
     }
 }
 
-/// The packed rows of a time step, and where in a [`Trajectory`] their states before it stand.
-struct Step {
-    now: Range<usize>,
-    before: Range<usize>,
-}
-
-impl Step {
-    fn all(packing: &Packing) -> Vec<Self> {
-        let mut start = 0;
-        packing
-            .steps()
-            .map(|now| {
-                let before = start..start + now.len();
-                start = now.start + packing.sequences() as usize;
-                Self { now, before }
-            })
-            .collect()
-    }
-}
-
-/// States before the first step and after each, in one tensor: `[sequences + rows, hidden]`.
-struct Trajectory {
-    states: Tensor,
-    sequences: usize,
-}
-
-impl Trajectory {
-    fn new(packing: &Packing, initial: &Tensor) -> Self {
-        let sequences = packing.sequences();
-        let states = empty(sequences + packing.rows(), initial.size()[1] as usize);
-        states.narrow(0, 0, sequences).copy_(initial);
-        Self { states, sequences: sequences as usize }
-    }
-
-    fn before(&self, step: &Step) -> Tensor {
-        narrow(&self.states, &step.before)
-    }
-
-    /// After each step, a row for each packed row.
-    fn after(&self) -> Tensor {
-        let rows = self.sequences..self.states.size()[0] as usize;
-        narrow(&self.states, &rows)
-    }
-
-    /// The numbers before and after a step.
-    fn slices(&mut self, step: &Step, hidden: usize) -> (&[f32], &mut [f32]) {
-        let start = (step.now.start + self.sequences) * hidden;
-        let (before, after) = floats_mut(&mut self.states).split_at_mut(start);
-        (&before[step.before.start * hidden..step.before.end * hidden], &mut after[..step.now.len() * hidden])
-    }
-}
-
 fn rows_mut<'a>(tensor: &'a mut Tensor, rows: &Range<usize>, width: usize) -> &'a mut [f32] {
     &mut floats_mut(tensor)[rows.start * width..rows.end * width]
 }
 
-fn narrow(tensor: &Tensor, rows: &Range<usize>) -> Tensor {
-    tensor.narrow(0, rows.start as i64, rows.len() as i64)
-}
+#[cfg(test)]
+mod tests {
+    use super::super::elementwise::numbers;
+    use super::super::elman_cpu::ElmanCell;
+    use super::super::gru_cpu::GruCell;
+    use super::super::lstm_cpu::LstmCell;
+    use super::{Backward, Cell, Forward, backward, forward};
 
-fn empty(rows: i64, width: usize) -> Tensor {
-    Tensor::empty([rows, width as i64], (Kind::Float, Device::Cpu))
+    const ROWS: usize = 3;
+
+    /// Everything that a step and its gradients write, in bits.
+    fn run<C: Cell>(hidden: usize, inputs: &[Vec<f32>; 7], c: &[f32], wide: bool) -> Vec<Vec<u32>> {
+        let [mut a, mut s, h, cell, grad_output, mut dh, mut dcell] = inputs.clone();
+        let (mut next_h, mut next_cell) = (h.clone(), cell.clone());
+        let forward = if wide { forward::<C> } else { C::forward };
+        forward(Forward {
+            hidden,
+            a: &mut a,
+            s: &mut s,
+            c,
+            h: &h,
+            cell: &cell,
+            next_h: &mut next_h,
+            next_cell: &mut next_cell,
+        });
+        let gates = a.clone();
+        let backward = if wide { backward::<C> } else { C::backward };
+        backward(Backward {
+            hidden,
+            a: &mut a,
+            s: &mut s,
+            h: &h,
+            cell: &cell,
+            next_h: &next_h,
+            grad_output: &grad_output,
+            dh: &mut dh,
+            dcell: &mut dcell,
+        });
+        let written = [next_h, next_cell, gates, a, s, dh, dcell];
+        written.iter().map(|x| x.iter().map(|x| x.to_bits()).collect()).collect()
+    }
+
+    /// The machine's widest vectors, no vectors but those of every machine, and one number at a time.
+    fn same_bits<C: Cell>() {
+        for hidden in [1, 3, 8, 16, 19, 64, 255, 256] {
+            let gates = C::GATES * hidden;
+            let widths = [gates, gates, hidden, hidden, hidden, hidden, hidden];
+            let mut seed = 0;
+            let inputs = widths.map(|width| {
+                seed += 1;
+                numbers(ROWS * width, seed)
+            });
+            let c = numbers(gates, 0);
+            let wide = run::<C>(hidden, &inputs, &c, true);
+            assert_eq!(wide, run::<C>(hidden, &inputs, &c, false), "hidden {hidden}");
+            // A unit alone is the scalar tail of a loop.
+            let (row, unit) = (ROWS - 1, hidden - 1);
+            let alone = inputs.clone().map(|x| {
+                let width = x.len() / ROWS;
+                (unit..width).step_by(hidden).map(|column| x[row * width + column]).collect()
+            });
+            let c: Vec<f32> = c.iter().skip(unit).step_by(hidden).copied().collect();
+            for (alone, wide) in run::<C>(1, &alone, &c, true).iter().zip(&wide) {
+                let width = wide.len() / ROWS;
+                let same: Vec<u32> = (unit..width).step_by(hidden).map(|column| wide[row * width + column]).collect();
+                assert_eq!(*alone, same, "hidden {hidden}");
+            }
+        }
+    }
+
+    #[test]
+    fn every_instruction_set_gives_the_same_bits() {
+        same_bits::<ElmanCell>();
+        same_bits::<GruCell>();
+        same_bits::<LstmCell>();
+    }
 }
