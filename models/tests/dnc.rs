@@ -58,14 +58,28 @@ fn used(memory: &dyn Memory, rows: i64) -> State {
 /// Outputs, the last state, d sum(output * weight) / d input and d parameters.
 type Result = (Tensor, State, Tensor, BTreeMap<String, Tensor>);
 
-fn own(memory: &dyn Memory, parameters: &BTreeMap<String, Tensor>, x: &Tensor, packing: &Packing, state: &State, weight: &Tensor) -> Result {
+fn own(
+    memory: &dyn Memory,
+    parameters: &BTreeMap<String, Tensor>,
+    x: &Tensor,
+    packing: &Packing,
+    state: &State,
+    weight: &Tensor,
+) -> Result {
     let x = x.detach().set_requires_grad(true);
     let scan = memory.scan(&x, packing, state);
     let grad_x = scan.backward.expect("a backward of its own")(weight);
     (scan.output, scan.state, grad_x, take_gradients(parameters))
 }
 
-fn autograd(memory: &dyn Memory, parameters: &BTreeMap<String, Tensor>, x: &Tensor, packing: &Packing, state: &State, weight: &Tensor) -> Result {
+fn autograd(
+    memory: &dyn Memory,
+    parameters: &BTreeMap<String, Tensor>,
+    x: &Tensor,
+    packing: &Packing,
+    state: &State,
+    weight: &Tensor,
+) -> Result {
     let x = x.detach().set_requires_grad(true);
     let scan = scan_by_steps(memory, &x, packing, state);
     (&scan.output * weight).sum(None::<Kind>).backward();

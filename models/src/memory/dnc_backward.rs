@@ -110,19 +110,27 @@ impl Interface<&mut [f32]> {
     fn chain(&mut self, d: &Self) {
         let tanh = [(&mut *self.read_keys, &d.read_keys), (&mut *self.write_key, &d.write_key)];
         for (y, d) in tanh.into_iter().chain([(&mut *self.write_vector, &d.write_vector)]) {
-            y.iter_mut().zip(&**d).for_each(|(y, d)| *y = d * (1.0 - *y * *y));
+            for (y, d) in y.iter_mut().zip(&**d) {
+                *y = d * (1.0 - *y * *y);
+            }
         }
         let sigmoid = [(&mut *self.erase, &d.erase), (&mut *self.free_gates, &d.free_gates)];
         for (y, d) in sigmoid.into_iter().chain([(&mut *self.gates, &d.gates)]) {
-            y.iter_mut().zip(&**d).for_each(|(y, d)| *y = d * (*y * (1.0 - *y)));
+            for (y, d) in y.iter_mut().zip(&**d) {
+                *y = d * (*y * (1.0 - *y));
+            }
         }
         for (y, d) in [(&mut *self.read_strengths, &d.read_strengths), (&mut *self.write_strength, &d.write_strength)] {
             // Softplus: 1 - exp(-y).
-            y.iter_mut().zip(&**d).for_each(|(y, d)| *y = d * -(-*y).exp_m1());
+            for (y, d) in y.iter_mut().zip(&**d) {
+                *y = d * -(-*y).exp_m1();
+            }
         }
         for (y, d) in self.modes.chunks_exact_mut(3).zip(d.modes.chunks_exact(3)) {
             let mean = dot(y, d);
-            y.iter_mut().zip(d).for_each(|(y, d)| *y *= d - mean);
+            for (y, d) in y.iter_mut().zip(d) {
+                *y *= d - mean;
+            }
         }
     }
 }
@@ -152,13 +160,16 @@ fn read(
     let d_content = &mut scratch.content[..s.heads * n];
     for (head, d_weights) in d_weights.chunks_exact(n).enumerate() {
         let modes = part(xi.modes, head, 3);
-        let forms = [part_mut(trace.backward, head, n), part_mut(trace.forward, head, n), part_mut(trace.content, head, n)];
+        let forms =
+            [part_mut(trace.backward, head, n), part_mut(trace.forward, head, n), part_mut(trace.content, head, n)];
         for (d, form) in part_mut(d.modes, head, 3).iter_mut().zip(&forms) {
             *d = dot(form, d_weights);
         }
         let [backward, forward, _] = forms;
         for (mode, d) in modes.iter().zip([backward, forward, part_mut(d_content, head, n)]) {
-            d.iter_mut().zip(d_weights).for_each(|(d, d_weight)| *d = mode * d_weight);
+            for (d, d_weight) in d.iter_mut().zip(d_weights) {
+                *d = mode * d_weight;
+            }
         }
     }
     let slopes = &mut scratch.cells[0][..n];
@@ -210,7 +221,7 @@ impl Found<'_> {
                 *d *= strengths[head] / (length * key_length + SMALL);
                 *slope -= *d * likeness * key_length;
             }
-            let d_length = -sum(n, |i| d[i] * likeness[i] * lengths[i]);
+            let d_length = -sum!(n, i => d[i] * likeness[i] * lengths[i]);
             let slope = if key_length > 0.0 { d_length / key_length } else { 0.0 };
             for (d, key) in part_mut(d_keys, head, width).iter_mut().zip(key) {
                 *d = slope * key;
@@ -232,17 +243,11 @@ impl Found<'_> {
 
 /// Link and precedence. Sets `d_w`.
 #[inline(always)]
-fn connect(
-    s: Sizes,
-    before: [&[f32]; FIELDS],
-    w: &[f32],
-    gradients: &mut [&mut [f32]; FIELDS],
-    d_w: &mut [f32],
-) {
+fn connect(s: Sizes, before: [&[f32]; FIELDS], w: &[f32], gradients: &mut [&mut [f32]; FIELDS], d_w: &mut [f32]) {
     let [_, link, precedence, ..] = before;
     let [_, d_link, d_precedence, _, d_next_w, _] = gradients;
     let n = s.cells;
-    let (kept, mean) = (1.0 - sum(n, |i| w[i]), dot(d_precedence, precedence));
+    let (kept, mean) = (1.0 - sum!(n, i => w[i]), dot(d_precedence, precedence));
     for (((d_w, next), d_precedence), ..) in d_w.iter_mut().zip(&**d_next_w).zip(&mut **d_precedence).zip(w) {
         *d_w = next + (*d_precedence - mean);
         *d_precedence *= kept;
@@ -250,7 +255,7 @@ fn connect(
     for (i, (d, link)) in d_link.chunks_exact_mut(n).zip(link.chunks_exact(n)).enumerate() {
         d[i] = 0.0;
         let down = w[i];
-        d_w[i] += sum(n, |j| d[j] * (precedence[j] - link[j]));
+        d_w[i] += sum!(n, j => d[j] * (precedence[j] - link[j]));
         for ((d_w, d), link) in d_w.iter_mut().zip(&*d).zip(link) {
             *d_w -= d * link;
         }
@@ -281,7 +286,7 @@ fn write(
     let d_w = &mut scratch.w[..n];
     let cells = d_memory.chunks_exact_mut(width).zip(memory.chunks_exact(width));
     for ((d_cell, cell), (d_w, w)) in cells.zip(d_w.iter_mut().zip(w)) {
-        *d_w += sum(width, |k| d_cell[k] * (xi.write_vector[k] - xi.erase[k] * cell[k]));
+        *d_w += sum!(width, k => d_cell[k] * (xi.write_vector[k] - xi.erase[k] * cell[k]));
         for ((d_erase, d_cell), cell) in d.erase.iter_mut().zip(&*d_cell).zip(cell) {
             *d_erase -= w * d_cell * cell;
         }
@@ -307,7 +312,7 @@ fn write(
     let [allocation_gate, write_gate] = [xi.gates[0], xi.gates[1]];
     let d_content = &mut scratch.content[..n];
     let content = &*trace.write_content;
-    let allocated = sum(n, |i| d_w[i] * ((1.0 - u[i]) * products[i]));
+    let allocated = sum!(n, i => d_w[i] * ((1.0 - u[i]) * products[i]));
     let found = dot(d_w, content);
     d.gates[0] = write_gate * (allocated - found);
     d.gates[1] = allocation_gate * allocated + (1.0 - allocation_gate) * found;
@@ -316,16 +321,7 @@ fn write(
         *d_content = write_gate * (1.0 - allocation_gate) * d_w;
     }
     let found = Found { lengths: trace.lengths[0], likeness: trace.write_likeness, content };
-    found.backward(
-        memory,
-        xi.write_key,
-        xi.write_strength,
-        d_content,
-        d.write_key,
-        d.write_strength,
-        d_memory,
-        slopes,
-    );
+    found.backward(memory, xi.write_key, xi.write_strength, d_content, d.write_key, d.write_strength, d_memory, slopes);
 
     let mut later = 0.0;
     for &mut i in order.iter_mut().rev() {
@@ -359,7 +355,9 @@ fn use_cells(
         }
         for (other, (free, weights)) in free.iter().zip(read_weights.chunks_exact(n)).enumerate() {
             if other != head {
-                others.iter_mut().zip(weights).for_each(|(others, weight)| *others *= 1.0 - free * weight);
+                for (others, weight) in others.iter_mut().zip(weights) {
+                    *others *= 1.0 - free * weight;
+                }
             }
         }
         *d_free = -dot(others, part(read_weights, head, n));
@@ -368,6 +366,8 @@ fn use_cells(
         }
     }
     for (free, weights) in free.iter().zip(read_weights.chunks_exact(n)) {
-        d_usage.iter_mut().zip(weights).for_each(|(d, weight)| *d *= 1.0 - free * weight);
+        for (d, weight) in d_usage.iter_mut().zip(weights) {
+            *d *= 1.0 - free * weight;
+        }
     }
 }

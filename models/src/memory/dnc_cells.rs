@@ -118,10 +118,14 @@ impl<'a> Interface<&'a mut [f32]> {
     #[inline(always)]
     pub(super) fn activate(&mut self) {
         for keys in [&mut *self.read_keys, &mut *self.write_key, &mut *self.write_vector] {
-            keys.iter_mut().for_each(|x| *x = tanh(*x));
+            for x in keys {
+                *x = tanh(*x);
+            }
         }
         for gates in [&mut *self.erase, &mut *self.free_gates, &mut *self.gates] {
-            gates.iter_mut().for_each(|x| *x = sigmoid(*x));
+            for x in gates {
+                *x = sigmoid(*x);
+            }
         }
         for strength in self.read_strengths.iter_mut().chain(&mut *self.write_strength) {
             *strength = strength.max(0.0) + (-strength.abs()).exp().ln_1p();
@@ -183,7 +187,8 @@ pub(super) fn keep_from_zero(usage: &[f32], kept: &mut [f32]) {
     }
 }
 
-const LANES: usize = 16;
+/// Numbers that are summed side by side: what the widest vectors hold.
+pub(super) const LANES: usize = 16;
 
 /// `out [r, n] += c [r, m] a [m, n]`.
 #[inline(always)]
@@ -234,42 +239,56 @@ pub(super) fn transpose(a: &[f32], out: &mut [f32], n: usize) {
     }
 }
 
-/// Sum of `f` over a row, in an order that no instruction set changes.
-#[inline(always)]
-pub(super) fn sum(n: usize, f: impl Fn(usize) -> f32) -> f32 {
-    let mut lanes = [0.0; LANES];
-    let done = n / LANES * LANES;
-    for block in (0..done).step_by(LANES) {
-        for (lane, sum) in lanes.iter_mut().enumerate() {
-            *sum += f(block + lane);
+/// `sum!(n, i => term)`: a sum over a row, in an order that no instruction set changes. A macro, because a closure would
+/// not be compiled for the caller's instruction set.
+macro_rules! sum {
+    ($n:expr, $i:ident => $term:expr) => {{
+        const LANES: usize = $crate::memory::dnc_cells::LANES;
+        let n: usize = $n;
+        let mut lanes = [0.0_f32; LANES];
+        let done = n / LANES * LANES;
+        for block in (0..done).step_by(LANES) {
+            for (lane, sum) in lanes.iter_mut().enumerate() {
+                let $i = block + lane;
+                *sum += $term;
+            }
         }
-    }
-    for (lane, sum) in lanes.iter_mut().enumerate().take(n - done) {
-        *sum += f(done + lane);
-    }
-    for half in [8, 4, 2, 1] {
-        for lane in 0..half {
-            lanes[lane] += lanes[lane + half];
+        for (lane, sum) in lanes.iter_mut().enumerate().take(n - done) {
+            let $i = done + lane;
+            *sum += $term;
         }
-    }
-    lanes[0]
+        for half in [8, 4, 2, 1] {
+            for lane in 0..half {
+                lanes[lane] += lanes[lane + half];
+            }
+        }
+        lanes[0]
+    }};
 }
+pub(super) use sum;
 
 /// Scalar product.
 #[inline(always)]
 pub(super) fn dot(a: &[f32], b: &[f32]) -> f32 {
     let n = a.len();
     let b = &b[..n];
-    sum(n, |i| a[i] * b[i])
+    sum!(n, i => a[i] * b[i])
 }
 
 /// In place.
 #[inline(always)]
 pub(super) fn softmax(x: &mut [f32]) {
-    let largest = x.iter().fold(f32::NEG_INFINITY, |a, &b| if b > a { b } else { a });
-    x.iter_mut().for_each(|x| *x = exp(*x - largest));
-    let scale = 1.0 / sum(x.len(), |i| x[i]);
-    x.iter_mut().for_each(|x| *x *= scale);
+    let mut largest = f32::NEG_INFINITY;
+    for &x in &*x {
+        largest = if x > largest { x } else { largest };
+    }
+    for x in &mut *x {
+        *x = exp(*x - largest);
+    }
+    let scale = 1.0 / sum!(x.len(), i => x[i]);
+    for x in x {
+        *x *= scale;
+    }
 }
 
 /// From d loss / d softmax to d loss / d its input, in place.

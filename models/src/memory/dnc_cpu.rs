@@ -233,7 +233,7 @@ impl Tape {
         let mut gradients = s.fields().map(|width| vec![0.0; sequences * width]);
         for (t, now) in self.steps.iter().enumerate().rev() {
             let previous = if t > 0 { self.steps[t - 1].clone() } else { 0..0 };
-            let [mut a, mut xi, mut dz_now] = [&self.a, &self.xi, dz].map(|x| narrow(x, now));
+            let [mut a, mut xi, dz_now] = [&self.a, &self.xi, dz].map(|x| narrow(x, now));
             let (mut initial, mut widths) = (fields(&self.initial).into_iter(), s.fields().into_iter());
             let pairs = self.fields.each_mut().map(|field| {
                 let (initial, width) = initial.next().zip(widths.next()).expect("one for each field");
@@ -284,8 +284,14 @@ fn lstm_rows(a: &mut [f32], c_before: &[f32], c: &mut [f32], z: &mut [f32], hidd
     for ((a, (c_before, c)), z) in a.chunks_exact_mut(4 * hidden).zip(cells).zip(z.chunks_exact_mut(z_width)) {
         let (i_f, g_o) = a.split_at_mut(2 * hidden);
         let (g, o) = g_o.split_at_mut(hidden);
-        i_f.iter_mut().chain(&mut *o).for_each(|x| *x = sigmoid(*x));
-        g.iter_mut().for_each(|x| *x = tanh(*x));
+        for gates in [&mut *i_f, &mut *o] {
+            for x in gates {
+                *x = sigmoid(*x);
+            }
+        }
+        for x in &mut *g {
+            *x = tanh(*x);
+        }
         let (i, f) = i_f.split_at(hidden);
         for ((((c, c_before), i), f), g) in c.iter_mut().zip(c_before).zip(i).zip(f).zip(g) {
             *c = f * c_before + i * *g;

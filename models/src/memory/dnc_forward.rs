@@ -155,7 +155,7 @@ fn connect(s: Sizes, before: [&[f32]; FIELDS], after: &mut [&mut [f32]; FIELDS])
         }
         next[i] = 0.0;
     }
-    let kept = 1.0 - sum(n, |i| w[i]);
+    let kept = 1.0 - sum!(n, i => w[i]);
     for ((next, precedence), w) in next_precedence.iter_mut().zip(precedence).zip(w) {
         *next = kept * precedence + w;
     }
@@ -204,7 +204,9 @@ fn lengths(transposed: &[f32], lengths: &mut [f32]) {
             *length += number * number;
         }
     }
-    lengths.iter_mut().for_each(|length| *length = length.sqrt());
+    for length in lengths {
+        *length = length.sqrt();
+    }
 }
 
 /// Likeness of each cell to each key, and weights over the cells made of it.
