@@ -39,8 +39,10 @@ use serde::{Deserialize, Serialize};
 use tch::nn::Path;
 use tch::{Device, Kind, Tensor};
 
-use super::{Memory, MemoryKind, State};
+use super::elementwise::on_cpu;
+use super::{Memory, MemoryKind, Scan, State, dnc_cpu, scan_by_steps};
 use crate::init::uniform;
+use crate::packing::Packing;
 
 /// Keeps logarithmic scales away from zero: in usages, and under the cosine's fraction.
 pub(super) const SMALL: f64 = 1e-6;
@@ -168,9 +170,40 @@ impl Memory for Dnc {
         let output = Tensor::cat(&[&h, &reads], 1).linear(&self.weight_output, Some(&self.bias_output));
         (output, State(vec![h, c, memory, link, precedence, read_weights, w, usage, reads]))
     }
+
+    fn act(&self, input: &Tensor, state: &State) -> (Tensor, State) {
+        if on_cpu(input) { dnc_cpu::act(self, input, state) } else { tch::no_grad(|| self.step(input, state)) }
+    }
+
+    fn scan(&self, input: &Tensor, packing: &Packing, state: &State) -> Scan {
+        if on_cpu(input) {
+            dnc_cpu::scan(self, input, packing, state)
+        } else {
+            scan_by_steps(self, input, packing, state)
+        }
+    }
 }
 
 impl Dnc {
+    /// The same parameters.
+    pub(super) fn shallow_clone(&self) -> Self {
+        let Self { hidden, cells, width, heads, .. } = *self;
+        Self {
+            hidden,
+            cells,
+            width,
+            heads,
+            weight_input: self.weight_input.shallow_clone(),
+            weight_state: self.weight_state.shallow_clone(),
+            bias_input: self.bias_input.shallow_clone(),
+            bias_state: self.bias_state.shallow_clone(),
+            weight_interface: self.weight_interface.shallow_clone(),
+            bias_interface: self.bias_interface.shallow_clone(),
+            weight_output: self.weight_output.shallow_clone(),
+            bias_output: self.bias_output.shallow_clone(),
+        }
+    }
+
     /// How well each cell would do for a new entry, `[rows, cells]`.
     fn allocation(&self, usage: &Tensor) -> Tensor {
         let (rising, order) = (SMALL + (1.0 - SMALL) * usage).sort_stable(true, 1, false);

@@ -83,7 +83,7 @@ pub(super) fn tanh(x: f32) -> f32 {
 /// it are vectorised: `exp(x) = 2^k exp(r)` with `k = round(x / ln 2)`, and a polynomial for `exp(r)`, `|r| <= ln(2) / 2`
 /// (Cephes, expf.c).
 #[inline(always)]
-fn exp(x: f32) -> f32 {
+pub(super) fn exp(x: f32) -> f32 {
     /// Added to a small number, leaves its nearest integer in the low bits.
     const ROUND: f32 = 12_582_912.0;
     // ln 2 in two parts; the product of `k` and the first is exact.

@@ -19,6 +19,10 @@ use crate::ModelError;
 use crate::packing::Packing;
 
 mod dnc;
+mod dnc_backward;
+mod dnc_cells;
+mod dnc_cpu;
+mod dnc_forward;
 mod elementwise;
 mod elman;
 mod elman_cpu;

@@ -1,0 +1,335 @@
+//! The DNC on the CPU: a loop over time with a backward of its own.
+//!
+//! A time step needs two matrix products forward, for the controller's gates and for the interface, and two backward; the
+//! products of the input, the output and all weights' gradients are one for all rows. They are libtorch's; the rest is
+//! plain Rust: the LSTM's pointwise part here, the memory cells in `dnc_forward.rs` and `dnc_backward.rs`.
+//!
+//! ```text
+//! a = W x + U [h ; r] + b,   i, f, o = sigmoid(a_i, a_f, a_o),   g = tanh(a_g)
+//! c' = f c + i g,   t = tanh(c'),   h' = o t
+//! dc' += dh' o (1 - t^2),   da = [dc' g i (1 - i), dc' c f (1 - f), dc' i (1 - g^2), dh' t o (1 - o)],   dc = dc' f
+//! ```
+//!
+//! `U` is `weight_state` and the read vectors' part of `weight_input`.
+
+// Only inlined code is compiled for the caller's instruction set.
+#![allow(clippy::inline_always)]
+
+use std::ops::Range;
+
+use tch::{Device, Kind, Tensor};
+
+use super::dnc::Dnc;
+use super::dnc_cells::{FIELDS, Sizes};
+use super::elementwise::{floats, floats_mut, sigmoid, tanh, widest};
+use super::{Backward, Scan, State, add_gradients, dnc_backward, dnc_forward};
+use crate::packing::Packing;
+
+/// Contiguous tensors of the state: h, c, the cells' fields, read vectors.
+fn contiguous(state: &State) -> Vec<Tensor> {
+    state.0.iter().map(Tensor::contiguous).collect()
+}
+
+fn fields(state: &[Tensor]) -> [&[f32]; FIELDS] {
+    std::array::from_fn(|field| floats(&state[2 + field]))
+}
+
+fn empty(rows: i64, width: usize) -> Tensor {
+    Tensor::empty([rows, width as i64], (Kind::Float, Device::Cpu))
+}
+
+fn narrow(tensor: &Tensor, rows: &Range<usize>) -> Tensor {
+    tensor.narrow(0, rows.start as i64, rows.len() as i64)
+}
+
+/// One time step, without gradients.
+pub(super) fn act(dnc: &Dnc, input: &Tensor, state: &State) -> (Tensor, State) {
+    tch::no_grad(|| {
+        let (s, state) = (dnc.sizes(), contiguous(state));
+        let rows = input.size()[0];
+        let mut a = dnc.bias().addmm(&Tensor::cat(&[input, &state[8]], 1), &dnc.weight_input.tr());
+        let _ = a.addmm_(&state[0], &dnc.weight_state.tr());
+        let mut z = empty(rows, dnc.hidden as usize + s.reads());
+        let mut next: Vec<Tensor> = state[1..8].iter().map(Tensor::empty_like).collect();
+        let hidden = dnc.hidden as usize;
+        lstm(floats_mut(&mut a), floats(&state[1]), floats_mut(&mut next[0]), floats_mut(&mut z), hidden);
+        let h = z.narrow(1, 0, dnc.hidden);
+        let mut xi = dnc.bias_interface.addmm(&h, &dnc.weight_interface.tr());
+        let mut after = next[1..].iter_mut();
+        let step = dnc_forward::Rows {
+            before: fields(&state),
+            after: std::array::from_fn(|_| floats_mut(after.next().expect("a tensor for each field"))),
+            xi: floats_mut(&mut xi),
+            z: floats_mut(&mut z),
+            trace: &mut vec![0.0; s.trace()],
+        };
+        dnc_forward::step(s, step, &mut dnc_forward::Scratch::new(s));
+        let output = dnc.bias_output.addmm(&z, &dnc.weight_output.tr());
+        next.insert(0, h.contiguous());
+        next.push(z.narrow(1, dnc.hidden, s.reads() as i64).contiguous());
+        (output, State(next))
+    })
+}
+
+/// Whole sequences: packed `input [rows, inputs]`, `initial` in packed order. If `input` wants gradients, what the backward
+/// needs is kept.
+pub(super) fn scan(dnc: &Dnc, input: &Tensor, packing: &Packing, initial: &State) -> Scan {
+    tch::no_grad(|| {
+        let mut tape = Tape::new(dnc, input, packing, initial);
+        tape.forward(dnc);
+        let output = dnc.bias_output.addmm(&tape.z, &dnc.weight_output.tr());
+        let state = tape.last(dnc, &packing.last_rows());
+        let backward = input.requires_grad().then(|| {
+            let dnc = dnc.shallow_clone();
+            Box::new(move |grad_output: &Tensor| tape.backward(&dnc, grad_output)) as Backward
+        });
+        Scan { output, state, computed_steps: packing.rows(), backward }
+    })
+}
+
+impl Dnc {
+    fn sizes(&self) -> Sizes {
+        Sizes { cells: self.cells as usize, width: self.width as usize, heads: self.heads as usize }
+    }
+
+    fn bias(&self) -> Tensor {
+        &self.bias_input + &self.bias_state
+    }
+
+    fn inputs(&self) -> i64 {
+        self.weight_input.size()[1] - self.heads * self.width
+    }
+
+    /// The gates' weights `[4 hidden, hidden + reads]` for what the step before left.
+    fn recurrent(&self) -> Tensor {
+        let reads = self.weight_input.narrow(1, self.inputs(), self.heads * self.width);
+        Tensor::cat(&[&self.weight_state, &reads], 1)
+    }
+}
+
+/// All that the steps compute, a row for each packed row.
+struct Tape {
+    steps: Vec<Range<usize>>,
+    input: Tensor,
+    initial: Vec<Tensor>,
+    /// Controller's output and read vectors: before the first step, and after each.
+    z_initial: Tensor,
+    z: Tensor,
+    /// Gates; then their gradients.
+    a: Tensor,
+    /// Interface; then its gradients.
+    xi: Tensor,
+    /// The LSTM's cells and the memory's fields after each step.
+    c: Vec<f32>,
+    fields: [Vec<f32>; FIELDS],
+    trace: Vec<f32>,
+}
+
+impl Tape {
+    fn new(dnc: &Dnc, input: &Tensor, packing: &Packing, initial: &State) -> Self {
+        let (s, rows) = (dnc.sizes(), packing.rows());
+        let initial = contiguous(initial);
+        let zeros = |width: usize| vec![0.0; rows as usize * width];
+        let weight = dnc.weight_input.narrow(1, 0, dnc.inputs());
+        Self {
+            steps: packing.steps().collect(),
+            input: input.detach(),
+            z_initial: Tensor::cat(&[&initial[0], &initial[8]], 1),
+            initial,
+            z: empty(rows, dnc.hidden as usize + s.reads()),
+            a: dnc.bias().addmm(input, &weight.tr()),
+            xi: empty(rows, s.interface()),
+            c: zeros(dnc.hidden as usize),
+            fields: s.fields().map(zeros),
+            trace: zeros(s.trace()),
+        }
+    }
+
+    fn forward(&mut self, dnc: &Dnc) {
+        let (s, hidden) = (dnc.sizes(), dnc.hidden as usize);
+        let (recurrent, interface) = (dnc.recurrent().tr(), dnc.weight_interface.tr());
+        let mut scratch = dnc_forward::Scratch::new(s);
+        let mut before = self.z_initial.shallow_clone();
+        let mut previous = 0..0;
+        for now in &self.steps {
+            let [mut a, mut z, mut xi] = [&self.a, &self.z, &self.xi].map(|x| narrow(x, now));
+            let _ = a.addmm_(&narrow(&before, &(0..now.len())), &recurrent);
+            let (c_before, c) = at(&mut self.c, floats(&self.initial[1]), &previous, now, hidden);
+            lstm(floats_mut(&mut a), c_before, c, floats_mut(&mut z), hidden);
+            let _ = dnc.bias_interface.addmm_out(&xi, &z.narrow(1, 0, dnc.hidden), &interface);
+
+            let (mut initial, mut widths) = (fields(&self.initial).into_iter(), s.fields().into_iter());
+            let pairs = self.fields.each_mut().map(|field| {
+                let (initial, width) = initial.next().zip(widths.next()).expect("one for each field");
+                at(field, initial, &previous, now, width)
+            });
+            let trace = &mut self.trace[now.start * s.trace()..now.end * s.trace()];
+            let rows = dnc_forward::Rows {
+                before: pairs.each_ref().map(|(before, _)| *before),
+                after: pairs.map(|(_, after)| after),
+                xi: floats_mut(&mut xi),
+                z: floats_mut(&mut z),
+                trace,
+            };
+            dnc_forward::step(s, rows, &mut scratch);
+            (before, previous) = (z, now.clone());
+        }
+    }
+
+    /// The state after each sequence's last step, which is in these rows.
+    fn last(&self, dnc: &Dnc, rows: &Tensor) -> State {
+        let sequences = rows.size()[0];
+        let indices: Vec<i64> = rows.try_into().expect("a vector");
+        let gather = |x: &[f32], shape: &[i64]| {
+            let width = shape.iter().product::<i64>() as usize;
+            let rows = indices.iter().flat_map(|&row| &x[row as usize * width..][..width]);
+            Tensor::from_slice(&rows.copied().collect::<Vec<f32>>()).view(&[&[sequences], shape].concat()[..])
+        };
+        let z = self.z.index_select(0, rows);
+        let mut state = vec![z.narrow(1, 0, dnc.hidden).contiguous(), gather(&self.c, &[dnc.hidden])];
+        for (field, like) in self.fields.iter().zip(&self.initial[2..]) {
+            state.push(gather(field, &like.size()[1..]));
+        }
+        state.push(z.narrow(1, dnc.hidden, dnc.heads * dnc.width).contiguous());
+        State(state)
+    }
+
+    /// From d loss / d output to d loss / d input; adds to the parameters' gradients.
+    fn backward(mut self, dnc: &Dnc, grad_output: &Tensor) -> Tensor {
+        let (gradients, grad_input) = tch::no_grad(|| {
+            let grad_output = grad_output.contiguous();
+            let recurrent = dnc.recurrent();
+            self.backward_steps(dnc, &grad_output.mm(&dnc.weight_output), &recurrent);
+            let sum = |x: &Tensor| x.sum_dim_intlist(0, false, Kind::Float);
+            let (da, dxi) = (&self.a, &self.xi);
+            let d_recurrent = da.tr().mm(&self.z_before());
+            let (inputs, reads) = (dnc.inputs(), dnc.heads * dnc.width);
+            let d_input = Tensor::cat(&[da.tr().mm(&self.input), d_recurrent.narrow(1, dnc.hidden, reads)], 1);
+            let d_state = d_recurrent.narrow(1, 0, dnc.hidden).contiguous();
+            let d_interface = dxi.tr().mm(&self.z.narrow(1, 0, dnc.hidden));
+            let d_output = grad_output.tr().mm(&self.z);
+            let biases = [sum(da), sum(da), sum(dxi), sum(&grad_output)];
+            let grad_input = da.mm(&dnc.weight_input.narrow(1, 0, inputs));
+            ([d_input, d_state, d_interface, d_output].into_iter().chain(biases).collect::<Vec<_>>(), grad_input)
+        });
+        let weights = [&dnc.weight_input, &dnc.weight_state, &dnc.weight_interface, &dnc.weight_output];
+        let biases = [&dnc.bias_input, &dnc.bias_state, &dnc.bias_interface, &dnc.bias_output];
+        add_gradients(&[weights, biases].concat(), &gradients);
+        grad_input
+    }
+
+    /// Controller's output and read vectors before each step.
+    fn z_before(&self) -> Tensor {
+        let rows = self.steps.windows(2).flat_map(|pair| (pair[0].start..).take(pair[1].len()));
+        let rows: Vec<i64> = rows.map(|row| row as i64).collect();
+        Tensor::cat(&[&self.z_initial, &self.z.index_select(0, &Tensor::from_slice(&rows))], 0)
+    }
+
+    /// Turns `a` and `xi` into their gradients. `dz` holds what comes through the output alone.
+    fn backward_steps(&mut self, dnc: &Dnc, dz: &Tensor, recurrent: &Tensor) {
+        let (s, hidden, sequences) = (dnc.sizes(), dnc.hidden as usize, self.steps[0].len());
+        let mut scratch = dnc_backward::Scratch::new(s);
+        let mut dc = vec![0.0; sequences * hidden];
+        let mut gradients = s.fields().map(|width| vec![0.0; sequences * width]);
+        for (t, now) in self.steps.iter().enumerate().rev() {
+            let previous = if t > 0 { self.steps[t - 1].clone() } else { 0..0 };
+            let [mut a, mut xi, dz_now] = [&self.a, &self.xi, dz].map(|x| narrow(x, now));
+            let (mut initial, mut widths) = (fields(&self.initial).into_iter(), s.fields().into_iter());
+            let pairs = self.fields.each_mut().map(|field| {
+                let (initial, width) = initial.next().zip(widths.next()).expect("one for each field");
+                at(field, initial, &previous, now, width)
+            });
+            let rows = dnc_backward::Rows {
+                before: pairs.each_ref().map(|(before, _)| *before),
+                after: pairs.map(|(_, after)| &*after),
+                xi: floats_mut(&mut xi),
+                grad_z: floats(&dz_now),
+                trace: &mut self.trace[now.start * s.trace()..now.end * s.trace()],
+                gradients: gradients.each_mut().map(Vec::as_mut_slice),
+            };
+            dnc_backward::step(s, rows, &mut scratch);
+            let _ = dz_now.narrow(1, 0, dnc.hidden).addmm_(&xi, &dnc.weight_interface);
+            let (c_before, c) = at(&mut self.c, floats(&self.initial[1]), &previous, now, hidden);
+            lstm_backward(floats_mut(&mut a), c_before, c, floats(&dz_now), &mut dc[..now.len() * hidden], hidden);
+            if t > 0 {
+                let _ = narrow(dz, &(previous.start..previous.start + now.len())).addmm_(&a, recurrent);
+            }
+        }
+    }
+}
+
+/// The numbers of a time step's rows before (those of the step before, or the initial ones) and after.
+fn at<'a>(
+    numbers: &'a mut [f32],
+    initial: &'a [f32],
+    previous: &Range<usize>,
+    now: &Range<usize>,
+    width: usize,
+) -> (&'a [f32], &'a mut [f32]) {
+    let (past, rest) = numbers.split_at_mut(now.start * width);
+    let before = if previous.is_empty() { initial } else { &past[previous.start * width..] };
+    (&before[..now.len() * width], &mut rest[..now.len() * width])
+}
+
+widest! {
+    /// Gates, cells and output of some rows: `a [rows, 4 hidden]` becomes i, f, g, o; the first numbers of each row of `z`
+    /// become h.
+    fn lstm(a: &mut [f32], c_before: &[f32], c: &mut [f32], z: &mut [f32], hidden: usize) = lstm_rows
+}
+
+#[inline(always)]
+fn lstm_rows(a: &mut [f32], c_before: &[f32], c: &mut [f32], z: &mut [f32], hidden: usize) {
+    let z_width = z.len() / (c.len() / hidden);
+    let cells = c_before.chunks_exact(hidden).zip(c.chunks_exact_mut(hidden));
+    for ((a, (c_before, c)), z) in a.chunks_exact_mut(4 * hidden).zip(cells).zip(z.chunks_exact_mut(z_width)) {
+        let (i_f, g_o) = a.split_at_mut(2 * hidden);
+        let (g, o) = g_o.split_at_mut(hidden);
+        for gates in [&mut *i_f, &mut *o] {
+            for x in gates {
+                *x = sigmoid(*x);
+            }
+        }
+        for x in &mut *g {
+            *x = tanh(*x);
+        }
+        let (i, f) = i_f.split_at(hidden);
+        for ((((c, c_before), i), f), g) in c.iter_mut().zip(c_before).zip(i).zip(f).zip(g) {
+            *c = f * c_before + i * *g;
+        }
+        for ((h, c), o) in z.iter_mut().zip(c).zip(o) {
+            *h = *o * tanh(*c);
+        }
+    }
+}
+
+widest! {
+    /// Gradients of the gates of some rows, in their place; `dc` of the cells after becomes that of the cells before. The
+    /// first numbers of each row of `dz` are dh.
+    fn lstm_backward(a: &mut [f32], c_before: &[f32], c: &[f32], dz: &[f32], dc: &mut [f32], hidden: usize) =
+        lstm_backward_rows
+}
+
+#[inline(always)]
+fn lstm_backward_rows(a: &mut [f32], c_before: &[f32], c: &[f32], dz: &[f32], dc: &mut [f32], hidden: usize) {
+    let z_width = dz.len() / (c.len() / hidden);
+    let cells = c_before.chunks_exact(hidden).zip(c.chunks_exact(hidden)).zip(dc.chunks_exact_mut(hidden));
+    for ((a, ((c_before, c), dc)), dh) in a.chunks_exact_mut(4 * hidden).zip(cells).zip(dz.chunks_exact(z_width)) {
+        let (i_f, g_o) = a.split_at_mut(2 * hidden);
+        let ((i, f), (g, o)) = (i_f.split_at_mut(hidden), g_o.split_at_mut(hidden));
+        for (((dc, c), o), dh) in dc.iter_mut().zip(c).zip(o).zip(dh) {
+            let t = tanh(*c);
+            *dc += dh * *o * (1.0 - t * t);
+            *o = dh * t * (*o * (1.0 - *o));
+        }
+        for ((i, g), dc) in i.iter_mut().zip(g).zip(&*dc) {
+            let di = dc * *g * (*i * (1.0 - *i));
+            *g = dc * *i * (1.0 - *g * *g);
+            *i = di;
+        }
+        for ((f, dc), c_before) in f.iter_mut().zip(dc).zip(c_before) {
+            let df = *dc * c_before * (*f * (1.0 - *f));
+            *dc *= *f;
+            *f = df;
+        }
+    }
+}
