@@ -74,12 +74,14 @@ impl Chunks {
         chunks.index_select(0, &self.join)
     }
 
-    /// The last chunk of each sequence, as [`Chunks::cut`], with the padding before the steps: `[sequences, size, width]`.
-    pub(crate) fn cut_last(&self, x: &Tensor) -> Tensor {
-        let cut = self.cut.view([-1, self.size]).index_select(0, &self.last);
+    /// The last chunk of each sequence, as [`Chunks::cut`], but with the padding before the steps: `[sequences, size, width]`;
+    /// and 1 for each step, 0 for padding, `[sequences, size]`.
+    pub(crate) fn cut_last(&self, x: &Tensor) -> (Tensor, Tensor) {
         let steps = Tensor::arange(self.size, (Kind::Int64, x.device())) + self.last_lengths.unsqueeze(1);
+        let cut = self.cut.view([-1, self.size]).index_select(0, &self.last);
         let cut = cut.gather(1, &steps.remainder(self.size), false);
-        with_zero_row(x).index_select(0, &cut.view(-1)).view([-1, self.size, x.size()[1]])
+        let last = with_zero_row(x).index_select(0, &cut.view(-1)).view([-1, self.size, x.size()[1]]);
+        (last, steps.ge(self.size).to_kind(x.kind()))
     }
 
     /// Of one entry a chunk along `dim`, those of the last chunk of each sequence, in packed order.

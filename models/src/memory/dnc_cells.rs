@@ -171,7 +171,7 @@ pub(super) fn rising(usage: &[f32], ranks: &mut [u32], order: &mut [usize]) {
     ranks.fill(0);
     for (j, other) in usage.iter().enumerate() {
         for (i, (rank, usage)) in ranks.iter_mut().zip(usage).enumerate() {
-            *rank += u32::from(other < usage) | (u32::from(other == usage) & u32::from(j < i));
+            *rank += u32::from(if j < i { other <= usage } else { other < usage });
         }
     }
     for (i, rank) in ranks.iter().enumerate() {

@@ -170,12 +170,6 @@ impl S4d {
             powers: powers.map(|part| part.to_kind(kind)),
         }
     }
-
-    /// `x [rows, inputs + 1]` with a last column of ones (zeros for padding) to `u [hidden, rows]`.
-    fn channels(&self, x: &Tensor) -> Tensor {
-        let [weight, bias] = self.input.parameters();
-        Tensor::cat(&[weight, &bias.unsqueeze(1)], 1).mm(&x.reshape([-1, weight.size()[1] + 1]).tr())
-    }
 }
 
 /// What a chunk of steps does to `u [hidden, chunks, steps]` and to states `[hidden, chunks, 2 modes]` (all real parts, then
@@ -258,9 +252,10 @@ impl Memory for S4d {
     fn scan(&self, input: &Tensor, packing: &Packing, state: &State) -> Scan {
         let chunks = Chunks::new(packing, CHUNK, input.device());
         let system = self.chunk_system(chunks.size());
-        let shape = [self.hidden_size, -1, chunks.size()];
-        let input = Tensor::cat(&[input, &input.new_ones([packing.rows(), 1], (input.kind(), input.device()))], 1);
-        let u = self.channels(&chunks.cut(&input)).view(shape);
+        let [weight, bias] = self.input.parameters();
+        let (bias, shape) = (bias.unsqueeze(1), [self.hidden_size, -1, chunks.size()]);
+        // Channels first, as the products below want them. Padding follows all other steps of its sequence: it changes none.
+        let u = bias.addmm(weight, &chunks.cut(input).flatten(0, 1).tr()).view(shape);
 
         let initial = Tensor::cat(&[&state.0[0], &state.0[1]], 2).transpose(0, 1);
         let whole = system.powers.map(|part| part.select(2, chunks.size()).unsqueeze(1));
@@ -272,7 +267,8 @@ impl Memory for S4d {
 
         let last = tch::no_grad(|| {
             // Sequences end at different steps of their last chunks. With the padding at the beginning they end together.
-            let u = self.channels(&chunks.cut_last(&input)).view(shape);
+            let (last, is_step) = chunks.cut_last(input);
+            let u = (bias * is_step.view([1, -1])).addmm(weight, &last.flatten(0, 1).tr()).view(shape);
             let decayed = decay(&chunks.last(&before, 1), &system.powers_of(chunks.last_lengths()));
             decayed + u.bmm(&system.to_state)
         });
