@@ -35,6 +35,10 @@ fn own_backwards_agree_with_autograd() {
     for name in NAMES {
         for hidden in [1, 19, 64] {
             let (memory, parameters) = memory(name, 12, &format!("hidden_size = {hidden}"));
+            if hidden == 1 {
+                // A single unit of IndRNN's is else often dead.
+                tch::no_grad(|| parameters.values().for_each(|x| drop(x.shallow_clone().abs_())));
+            }
             let packing = Packing::new(&RAGGED);
             let x = random(packing.rows(), 12).set_requires_grad(true);
             let weight = random(packing.rows(), hidden);

@@ -12,7 +12,7 @@
 //! options; they are not learned and not saved. State: `h [rows, hidden]` and `m [rows, memory]`. Nothing differs from
 //! upstream POPGym.
 //!
-//! On the CPU a scan needs one matrix product a time step, see `lmu_cpu.rs`.
+//! On the CPU a scan has a backward of its own, see `lmu_cpu.rs`.
 
 use serde::{Deserialize, Serialize};
 use tch::nn::{Init, Path};
