@@ -25,11 +25,15 @@ fn scan_all(memory: &dyn Memory, sequences: &[Tensor]) -> (Vec<Tensor>, Vec<Stat
     (unpack(&scan.output, &packing), states)
 }
 
-fn assert_states_close(a: &State, b: &State, what: &str) {
-    assert_eq!(a.0.len(), b.0.len(), "{what}");
-    for (i, (a, b)) in a.0.iter().zip(&b.0).enumerate() {
-        assert_close(a, b, 1e-5, &format!("{what}, state {i}"));
-    }
+/// States are equal if what follows from them is. (Rounding may decide which of a DNC's unused cells is written; it makes no
+/// difference to anything read later.)
+fn assert_states_equal(memory: &dyn Memory, a: &State, b: &State, what: &str) {
+    let x = random(6, WIDTH);
+    let follow = |state: &State| {
+        let state = State(state.0.iter().map(Tensor::copy).collect());
+        by_steps(&x, state, |x, state| memory.step(x, state)).0
+    };
+    assert_close(&follow(a), &follow(b), 1e-5, &format!("{what}: what follows"));
 }
 
 fn assert_forms_agree(name: &str, memory: &dyn Memory, lengths: &[i64]) {
@@ -41,10 +45,10 @@ fn assert_forms_agree(name: &str, memory: &dyn Memory, lengths: &[i64]) {
         let (stepped, last) = by_steps(sequence, initial(), |x, state| memory.step(x, state));
         assert_eq!(output.size(), [sequence.size()[0], memory.output_width()], "{what}");
         assert_close(output, &stepped, 1e-5, &format!("{what}, scan"));
-        assert_states_close(state, &last, &format!("{what}, scan"));
+        assert_states_equal(memory, state, &last, &format!("{what}, scan"));
         let (acted, last_acted) = by_steps(sequence, initial(), |x, state| memory.act(x, state));
         assert_close(&acted, &stepped, 1e-5, &format!("{what}, act"));
-        assert_states_close(&last_acted, &last, &format!("{what}, act"));
+        assert_states_equal(memory, &last_acted, &last, &format!("{what}, act"));
     }
 }
 
@@ -99,7 +103,7 @@ proptest! {
                 state = scan.state;
             }
             assert_close(&Tensor::cat(&outputs, 0), &whole[0], 1e-5, &format!("{name}, cut at {cuts:?}"));
-            assert_states_close(&state, &last[0], &format!("{name}, cut at {cuts:?}"));
+            assert_states_equal(&*memory, &state, &last[0], &format!("{name}, cut at {cuts:?}"));
         }
     }
 
@@ -128,7 +132,7 @@ proptest! {
             let alone = scan_all(&*memory, &[episode.shallow_clone()]);
             let (outputs, states) = scan_all(&*memory, &batch);
             assert_close(&outputs[place], &alone.0[0], 1e-5, &what);
-            assert_states_close(&states[place], &alone.1[0], &what);
+            assert_states_equal(&*memory, &states[place], &alone.1[0], &what);
 
             let gradient = |batch: &[Tensor], weights: &[Tensor], place: usize| {
                 let (packing, x) = pack(batch);
