@@ -55,7 +55,7 @@ fn own_backwards_agree_with_autograd() {
             let own = gradients(own, &x, &weight, &parameters);
             let by_steps = gradients(by_steps, &x, &weight, &parameters);
             assert_close(&own.0, &by_steps.0, 1e-5, &what);
-            assert_gradients_close(&own.1, &by_steps.1, 5e-5, &what);
+            assert_gradients_close(&own.1, &by_steps.1, 1e-5, &what);
         }
     }
 }
