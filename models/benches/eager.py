@@ -382,7 +382,7 @@ class Bench:
         times, begun = [], self.now()
         while not times or self.now() - begun < seconds:
             state, start, count = self.memory.start(x), self.now(), 0
-            while count < EPISODE and (count % 16 or time.perf_counter() - start < seconds):
+            while count == 0 or count < EPISODE and (count % 16 or time.perf_counter() - start < seconds):
                 _, state = self.memory.step(x, state)
                 count += 1
             times.append((self.now() - start) / count)

@@ -56,12 +56,14 @@ fn main() -> ExitCode {
     let arguments: Vec<String> = std::env::args().skip(1).collect();
     let done = match arguments.split_first() {
         Some((first, rest)) if first == peak::ARGUMENT => peak::child(rest),
-        _ => Options::parse(&arguments).and_then(|options| match options {
-            Some(options) => run(&options),
-            None => {
-                println!("{USAGE}");
-                Ok(())
-            }
+        _ => Options::parse(&arguments).and_then(|options| {
+            options.map_or_else(
+                || {
+                    println!("{USAGE}");
+                    Ok(())
+                },
+                |options| run(&options),
+            )
         }),
     };
     match done {
