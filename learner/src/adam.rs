@@ -24,6 +24,7 @@ pub struct AdamOptions {
 #[derive(Debug)]
 pub struct Adam {
     options: AdamOptions,
+    names: Vec<String>,
     parameters: Vec<Tensor>,
     state: AdamState,
 }
@@ -42,11 +43,12 @@ pub struct AdamState {
 impl Adam {
     /// An optimiser of `parameters`, moments zero.
     pub fn new(parameters: &BTreeMap<String, Tensor>, options: AdamOptions) -> Self {
+        let names = parameters.keys().cloned().collect();
         let parameters: Vec<Tensor> = parameters.values().map(Tensor::shallow_clone).collect();
         let length: i64 = parameters.iter().map(|parameter| parameter.numel() as i64).sum();
         let zeros = || Tensor::zeros([length], (Kind::Float, parameters[0].device()));
         let state = AdamState { first_moment: zeros(), second_moment: zeros(), steps: 0 };
-        Self { options, parameters, state }
+        Self { options, names, parameters, state }
     }
 
     /// The state, to be saved.
@@ -79,22 +81,44 @@ impl Adam {
     }
 
     /// One update by the parameters' gradients. Returns the gradient's norm before it was scaled down, a scalar on the
-    /// parameters' device (no synchronisation).
-    pub fn step(&mut self, learning_rate: f64) -> Tensor {
+    /// parameters' device.
+    ///
+    /// # Errors
+    /// The first gradient or updated parameter with a number that is not finite. In the first case nothing has been changed.
+    pub fn step(&mut self, learning_rate: f64) -> Result<Tensor, String> {
         tch::no_grad(|| {
-            let gradients: Vec<Tensor> = self.parameters.iter().map(|parameter| gradient(parameter).view(-1)).collect();
-            let mut gradient = Tensor::cat(&gradients, 0);
-            let norm = gradient.norm();
+            let gradients: Vec<Tensor> = self.parameters.iter().map(gradient).collect();
+            let flat: Vec<Tensor> = gradients.iter().map(|gradient| gradient.view(-1)).collect();
+            let mut flat = Tensor::cat(&flat, 0);
+            let norm = flat.norm();
+            if !is_finite(&norm) {
+                return Err(format!("the gradient of `{}`", self.not_finite(&gradients)));
+            }
             if self.options.max_grad_norm > 0.0 {
                 let scale = (norm.reciprocal() * self.options.max_grad_norm).clamp_max(1.0);
-                let _ = gradient.g_mul_(&scale);
+                let _ = flat.g_mul_(&scale);
             }
-            self.apply(&gradient, learning_rate);
-            norm
+            let update = self.update(&flat, learning_rate);
+            self.apply(&update);
+            // A sum is finite only if all its terms are, and these are far from overflowing it.
+            if !is_finite(&update.norm()) {
+                return Err(format!("`{}`", self.not_finite(&self.parameters)));
+            }
+            Ok(norm)
         })
     }
 
-    fn apply(&mut self, gradient: &Tensor, learning_rate: f64) {
+    /// The name of the first of these tensors, one for each parameter, that is not finite; the largest if it is only their
+    /// common norm that overflows.
+    fn not_finite(&self, tensors: &[Tensor]) -> &str {
+        let named = || self.names.iter().zip(tensors);
+        let infinite = named().find(|(_, tensor)| !is_finite(&tensor.norm()));
+        let largest = || named().max_by(|a, b| norm(a.1).total_cmp(&norm(b.1)));
+        infinite.or_else(largest).map_or("", |(name, _)| name)
+    }
+
+    /// What is to be added to the parameters, flat.
+    fn update(&mut self, gradient: &Tensor, learning_rate: f64) -> Tensor {
         let AdamOptions { beta1, beta2, epsilon, .. } = self.options;
         let state = &mut self.state;
         state.steps += 1;
@@ -104,7 +128,10 @@ impl Adam {
         let correction2 = 1.0 - beta2.powf(state.steps as f64);
         let mut denominator = (&state.second_moment / correction2).sqrt_();
         let _ = denominator.g_add_scalar_(epsilon);
-        let update = (&state.first_moment / denominator) * (-learning_rate / correction1);
+        (&state.first_moment / denominator) * (-learning_rate / correction1)
+    }
+
+    fn apply(&mut self, update: &Tensor) {
         let mut start = 0;
         for parameter in &mut self.parameters {
             let length = parameter.numel() as i64;
@@ -112,6 +139,14 @@ impl Adam {
             start += length;
         }
     }
+}
+
+fn norm(tensor: &Tensor) -> f64 {
+    tensor.norm().double_value(&[])
+}
+
+fn is_finite(scalar: &Tensor) -> bool {
+    scalar.double_value(&[]).is_finite()
 }
 
 /// The gradient, or zeros for a parameter that the loss does not reach.
@@ -134,7 +169,7 @@ mod tests {
         for _ in 0..updates {
             adam.zero_grad();
             (x - target).square().sum(Kind::Float).backward();
-            let _norm = adam.step(0.1);
+            adam.step(0.1).unwrap();
         }
     }
 
@@ -171,10 +206,31 @@ mod tests {
         let options = AdamOptions { beta1: 0.0, max_grad_norm: 1.0, ..OPTIONS };
         let mut adam = Adam::new(&BTreeMap::from([("x".to_owned(), x.shallow_clone())]), options);
         (&x * Tensor::from_slice(&[3.0f32, 4.0])).sum(Kind::Float).backward();
-        let norm = adam.step(0.1).double_value(&[]);
+        let norm = adam.step(0.1).unwrap().double_value(&[]);
         assert!((norm - 5.0).abs() < 1e-5);
         let clipped = Vec::<f32>::try_from(&adam.state().first_moment).unwrap();
         assert!((clipped[0] - 0.6).abs() < 1e-6 && (clipped[1] - 0.8).abs() < 1e-6, "{clipped:?}");
+    }
+
+    #[test]
+    fn what_is_not_finite_is_named() {
+        let fresh = || Tensor::from_slice(&[1.0f32, 2.0]).set_requires_grad(true);
+        let (x, y) = (fresh(), fresh());
+        let parameters = BTreeMap::from([("x".to_owned(), x.shallow_clone()), ("y".to_owned(), y.shallow_clone())]);
+        let mut adam = Adam::new(&parameters, OPTIONS);
+        let mut step = |factor: f64, learning_rate| {
+            adam.zero_grad();
+            (x.square().sum(Kind::Float) + (&y * factor).sum(Kind::Float)).backward();
+            adam.step(learning_rate).map(|_| ())
+        };
+        for factor in [f64::NAN, f64::INFINITY] {
+            assert_eq!(step(factor, 0.1), Err("the gradient of `y`".to_owned()));
+        }
+        // Finite numbers whose squares are not: the moments would be lost.
+        assert_eq!(step(1e30, 0.1), Err("the gradient of `y`".to_owned()));
+        assert_eq!(Vec::<f32>::try_from(&x).unwrap(), [1.0, 2.0], "nothing has been changed");
+        assert_eq!(step(1.0, 0.1), Ok(()));
+        assert_eq!(step(1.0, 1e39), Err("`x`".to_owned()));
     }
 
     #[test]

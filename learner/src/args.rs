@@ -32,6 +32,8 @@ pub enum Command {
     Play(PlayArgs),
     /// Watch a trained agent play, in the terminal or as an animated GIF
     Watch(WatchArgs),
+    /// Write a trained agent as a file that other programs run
+    Export(ExportArgs),
     /// Show what can be named
     List(ListArgs),
 }
@@ -176,6 +178,19 @@ pub struct ResumeArgs {
     /// Keys of `[service]`.
     #[command(flatten)]
     pub service: ServiceFlags,
+}
+
+/// `learner export`.
+#[derive(Debug, clap::Args)]
+pub struct ExportArgs {
+    /// Directory of the run
+    pub dir: PathBuf,
+    /// TorchScript of one time step, for Python's torch.jit.load and for C++; FILE.json says what goes in and out
+    #[arg(long, value_name = "FILE")]
+    pub torchscript: PathBuf,
+    /// Which weights: of the checkpoint with the best mean return, or the last
+    #[arg(long, value_enum, default_value_t = Which::Best)]
+    pub checkpoint: Which,
 }
 
 /// `learner eval`.

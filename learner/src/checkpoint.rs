@@ -13,6 +13,7 @@ use anyhow::{Context, bail, ensure};
 use bytes::Bytes;
 use popgym_models::weights;
 use serde::{Deserialize, Serialize};
+use serde_json::Value;
 use sha2::{Digest, Sha256};
 use tch::{Kind, Tensor};
 
@@ -61,8 +62,8 @@ pub struct Checkpoint {
 #[derive(Serialize, Deserialize)]
 struct Manifest {
     format: u32,
-    /// Environment id, memory and other things that tell a person what this is.
-    about: BTreeMap<String, String>,
+    /// What this is ([`crate::manifest::describe`]).
+    about: Value,
     progress: Progress,
     optimizer_steps: u64,
     /// File name to SHA-256, hexadecimal.
@@ -70,11 +71,11 @@ struct Manifest {
 }
 
 impl Checkpoint {
-    /// Writes the checkpoint below `dir` and returns its path. `about` is kept in the manifest for people.
+    /// Writes the checkpoint below `dir` and returns its path. `about` is kept in the manifest.
     ///
     /// # Errors
     /// The file or directory that cannot be written. What was there before is untouched.
-    pub fn save(&self, dir: &Path, about: &BTreeMap<String, String>) -> anyhow::Result<PathBuf> {
+    pub fn save(&self, dir: &Path, about: &Value) -> anyhow::Result<PathBuf> {
         let path = dir.join(format!("epoch-{:06}", self.progress.epoch));
         let temporary = path.with_extension(TEMPORARY_SUFFIX.trim_start_matches('.'));
         remove_dir_if_there(&temporary)?;
@@ -288,7 +289,7 @@ mod tests {
     fn what_is_saved_is_loaded() {
         let dir = tempfile::tempdir().unwrap();
         let saved = checkpoint(12, 0.25);
-        let path = saved.save(dir.path(), &BTreeMap::new()).unwrap();
+        let path = saved.save(dir.path(), &Value::Null).unwrap();
         let loaded = Checkpoint::load(&path, 3).unwrap();
         assert_eq!(loaded.progress, saved.progress);
         assert_eq!((loaded.weights, loaded.sampling), (saved.weights, saved.sampling));
@@ -303,7 +304,7 @@ mod tests {
         let dir = tempfile::tempdir().unwrap();
         assert!(Checkpoint::latest(dir.path(), 3, 9).unwrap().is_none());
         for epoch in [2, 4, 6] {
-            checkpoint(epoch, 0.0).save(dir.path(), &BTreeMap::new()).unwrap();
+            checkpoint(epoch, 0.0).save(dir.path(), &Value::Null).unwrap();
         }
         let latest = |rows| Checkpoint::latest(dir.path(), 3, rows).map(|found| found.unwrap().progress.epoch);
         assert_eq!(latest(9).unwrap(), 6);
@@ -319,7 +320,7 @@ mod tests {
     fn the_last_few_and_the_best_are_kept() {
         let dir = tempfile::tempdir().unwrap();
         for (epoch, mean_return) in [(1, 0.1), (2, 0.9), (3, 0.3), (4, 0.2), (5, 0.4)] {
-            checkpoint(epoch, mean_return).save(dir.path(), &BTreeMap::new()).unwrap();
+            checkpoint(epoch, mean_return).save(dir.path(), &Value::Null).unwrap();
         }
         prune(dir.path(), 2).unwrap();
         assert_eq!(epochs(dir.path()), [2, 4, 5]);

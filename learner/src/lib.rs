@@ -26,6 +26,7 @@ mod files;
 pub mod gae;
 pub mod interrupt;
 pub mod local_actors;
+mod manifest;
 pub mod observer;
 pub mod ppo_keys;
 pub mod run_dir;
@@ -95,6 +96,7 @@ pub fn run(extensions: Extensions, arguments: impl IntoIterator<Item = OsString>
         Command::Train(args) => commands::train(&args, extensions),
         Command::Resume(args) => commands::resume(&args, extensions),
         Command::Eval(args) => commands::eval(&args, &extensions),
+        Command::Export(args) => commands::export(&args, &extensions),
         Command::Play(args) => commands::play(&args, &extensions),
         Command::Watch(args) => commands::watch(&args, &extensions),
         Command::List(args) => commands::list(&args, &extensions),

@@ -4,7 +4,6 @@
 //! update; with lag 1 with version `k - 1`, while the learner learns from epoch `k - 1`. Nothing here depends on who
 //! sampled an episode, or when.
 
-use std::collections::BTreeMap;
 use std::path::PathBuf;
 use std::time::Instant;
 
@@ -44,6 +43,8 @@ pub struct Trainer<'a> {
     pub observers: Vec<Box<dyn Observer>>,
     /// Where checkpoints go.
     pub checkpoints: PathBuf,
+    /// What their manifests say of them ([`crate::manifest::describe`]).
+    pub about: serde_json::Value,
     /// Set when the user wants to stop.
     pub interrupt: &'a Interrupt,
     /// Set when local actors cannot work.
@@ -249,13 +250,7 @@ impl Trainer<'_> {
         if epoch == 0 || state.saved_epoch == Some(epoch) {
             return true;
         }
-        let about = BTreeMap::from([
-            ("env".to_owned(), self.config.env.clone()),
-            ("memory".to_owned(), self.config.memory_name().to_owned()),
-            ("preset".to_owned(), self.config.preset.clone()),
-            ("build".to_owned(), env!("CARGO_PKG_VERSION").to_owned()),
-        ]);
-        match state.snapshot.save(&self.checkpoints, &about) {
+        match state.snapshot.save(&self.checkpoints, &self.about) {
             Ok(path) => {
                 state.saved_epoch = Some(epoch);
                 self.tell(|observer| observer.checkpoint(epoch, &path));

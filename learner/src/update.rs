@@ -41,12 +41,17 @@ pub enum UpdateError {
     #[error("interrupted")]
     Interrupted,
     /// The update diverged.
-    #[error("the update diverged: {quantity} is {value}; nothing of it is kept (a lower ppo.learning_rate may help)")]
+    #[error(
+        "the update diverged: {tensor} is not finite in minibatch {minibatch} of pass {pass}; nothing of this update is \
+         kept (a lower ppo.learning_rate may help)"
+    )]
     NotFinite {
         /// What is not finite.
-        quantity: &'static str,
-        /// Its value.
-        value: f64,
+        tensor: String,
+        /// The pass over the batch, from 1.
+        pass: u32,
+        /// The minibatch of the pass, from 1.
+        minibatch: usize,
     },
 }
 
@@ -63,8 +68,8 @@ pub fn update(
     interrupted: &dyn Fn() -> bool,
 ) -> Result<UpdateMeans, UpdateError> {
     let mut totals = Totals::new(policy.device());
-    for _ in 0..ppo.passes {
-        for episodes in minibatches(&batch.lengths, ppo.minibatch_steps, rng) {
+    for pass in 1..=ppo.passes {
+        for (episodes, number) in minibatches(&batch.lengths, ppo.minibatch_steps, rng).into_iter().zip(1..) {
             if interrupted() {
                 return Err(UpdateError::Interrupted);
             }
@@ -84,12 +89,14 @@ pub fn update(
 
             adam.zero_grad();
             outputs.backward(&loss);
-            let grad_norm = adam.step(schedule.learning_rate);
+            let grad_norm = adam
+                .step(schedule.learning_rate)
+                .map_err(|tensor| UpdateError::NotFinite { tensor, pass, minibatch: number })?;
             let means = [&losses.policy, &losses.value, &losses.kl, &losses.entropy, &grad_norm];
             totals.add(&means, minibatch.packing.rows(), computed_steps);
         }
     }
-    totals.means()
+    Ok(totals.means())
 }
 
 /// What changes from epoch to epoch.
@@ -204,21 +211,17 @@ impl Totals {
         self.computed_steps += computed_steps;
     }
 
-    fn means(self) -> Result<UpdateMeans, UpdateError> {
+    fn means(self) -> UpdateMeans {
         let means = Vec::<f64>::try_from((self.sums / self.steps as f64).to_device(Device::Cpu))
             .expect("five f64 numbers on the CPU are a vector");
-        let names = ["policy loss", "value loss", "KL", "entropy", "gradient norm"];
-        if let Some((quantity, &value)) = names.into_iter().zip(&means).find(|(_, value)| !value.is_finite()) {
-            return Err(UpdateError::NotFinite { quantity, value });
-        }
-        Ok(UpdateMeans {
+        UpdateMeans {
             policy_loss: means[0],
             value_loss: means[1],
             kl: means[2],
             entropy: means[3],
             grad_norm: means[4],
             valid_fraction: self.steps as f64 / self.computed_steps as f64,
-        })
+        }
     }
 }
 

@@ -111,6 +111,71 @@ impl Encoder {
     }
 }
 
+/// [`Encoder::features`] from plain numbers and of libtorch's operators alone, for a policy that leaves this program.
+///
+/// A row holds the numbers of the space's components in their order: the class of a discrete one, the value of a real one.
+#[derive(Debug)]
+pub(crate) struct NumberEncoder {
+    observation: Vec<Leaf>,
+    action: Vec<Leaf>,
+    null_action: Tensor,
+}
+
+impl NumberEncoder {
+    /// For the same spaces as an [`Encoder`].
+    pub(crate) fn new(observation: &Space, action: &Space) -> Self {
+        let null = null_action(action);
+        let mut real = null.real.iter();
+        let number = |leaf: &Leaf| match leaf {
+            Leaf::Discrete { .. } => 0.0,
+            Leaf::Real { .. } => *real.next().expect("as many as there are real leaves"),
+        };
+        let action: Vec<Leaf> = action.leaves().into_iter().collect();
+        let numbers: Vec<f32> = action.iter().map(number).collect();
+        let null_action = Tensor::from_slice(&numbers).view([1, -1]);
+        Self { observation: observation.leaves().into_iter().collect(), action, null_action }
+    }
+
+    /// Components of an observation and of an action.
+    pub(crate) fn components(&self) -> (usize, usize) {
+        (self.observation.len(), self.action.len())
+    }
+
+    /// Input vectors `[rows, width]` from `observation [rows, components]`, `previous_action [rows, components]` (not looked
+    /// at where `first`) and `first [rows]` (bool).
+    pub(crate) fn features(&self, observation: &Tensor, previous_action: &Tensor, first: &Tensor) -> Tensor {
+        let first = first.unsqueeze(1);
+        let previous_action = self.null_action.where_self(&first, previous_action);
+        let flags = Tensor::cat(&[first.logical_not(), first], 1).to_kind(Kind::Float);
+        let mut parts = one_hot(observation, &self.observation);
+        parts.extend(one_hot(&previous_action, &self.action));
+        parts.push(flags);
+        Tensor::cat(&parts, 1)
+    }
+}
+
+/// The columns of `numbers`, those of discrete components one-hot: a tensor for each run of equal components.
+fn one_hot(numbers: &Tensor, leaves: &[Leaf]) -> Vec<Tensor> {
+    let classes = |leaf: &Leaf| match leaf {
+        Leaf::Discrete { classes } => Some(i64::from(*classes)),
+        Leaf::Real { .. } => None,
+    };
+    let mut at = 0;
+    let runs = leaves.chunk_by(|a, b| classes(a) == classes(b)).map(|run| {
+        let count = run.len() as i64;
+        let columns = numbers.narrow(1, at, count);
+        at += count;
+        match classes(&run[0]) {
+            None => columns,
+            Some(classes) => {
+                let each = Tensor::arange(classes, (Kind::Float, Device::Cpu));
+                columns.unsqueeze(2).eq_tensor(&each).to_kind(Kind::Float).view([-1, count * classes])
+            }
+        }
+    });
+    runs.collect()
+}
+
 fn index_tensor(values: &[usize], device: Device) -> Tensor {
     let values: Vec<i64> = values.iter().map(|&value| value as i64).collect();
     Tensor::from_slice(&values).to_device(device)

@@ -7,12 +7,15 @@
 //! | [`policy`] | encoder, memory and heads put together: the paper's outer model |
 //! | [`distribution`] | what the actor head's numbers mean, and how an action is drawn |
 //! | [`packing`] | sequences of unequal length without padding |
+//! | [`export`] | a policy's step as TorchScript |
 //! | [`weights`] | weights as safetensors, every name and shape checked |
 //! | [`device`] | CPU and CUDA; the CUDA half of libtorch is opened only when asked for |
 
+mod chunks;
 pub mod device;
 pub mod distribution;
 pub mod encoder;
+pub mod export;
 mod init;
 pub mod memory;
 pub mod packing;

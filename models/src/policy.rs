@@ -29,8 +29,8 @@ use crate::packing::Packing;
 use crate::positional::PositionalEncoding;
 use crate::weights::{self, WeightsError};
 
-/// Width of the projection and of the heads' layers.
-const WIDTH: i64 = 128;
+/// Width of the projection, which is the memory's input, and of the heads' layers.
+pub const WIDTH: i64 = 128;
 
 /// Options of the policy outside its memory.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]

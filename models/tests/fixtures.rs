@@ -30,19 +30,96 @@ fn as_recorded(state: Vec<Tensor>) -> Vec<Tensor> {
     state
 }
 
-const CASES: &[Case] = &[Case {
-    name: "gru",
-    options: "hidden_size = 8",
-    parameters: &[
-        ("weight_ih_l0", "weight_input"),
-        ("weight_hh_l0", "weight_state"),
-        ("bias_ih_l0", "bias_input"),
-        ("bias_hh_l0", "bias_state"),
-    ],
-    identities: &[],
-    zeros: &[],
-    final_state: as_recorded,
-}];
+/// PyTorch's names of a recurrent layer's parameters and ours.
+const RECURRENT: &[(&str, &str)] = &[
+    ("weight_ih_l0", "weight_input"),
+    ("weight_hh_l0", "weight_state"),
+    ("bias_ih_l0", "bias_input"),
+    ("bias_hh_l0", "bias_state"),
+];
+
+const CASES: &[Case] = &[
+    Case {
+        name: "elman",
+        options: "hidden_size = 8",
+        parameters: RECURRENT,
+        identities: &[],
+        zeros: &[],
+        final_state: as_recorded,
+    },
+    Case {
+        name: "lstm",
+        options: "hidden_size = 8",
+        parameters: RECURRENT,
+        identities: &[],
+        zeros: &[],
+        final_state: as_recorded,
+    },
+    Case {
+        name: "gru",
+        options: "hidden_size = 8",
+        parameters: RECURRENT,
+        identities: &[],
+        zeros: &[],
+        final_state: as_recorded,
+    },
+    Case {
+        name: "dnc",
+        options: "hidden_size = 8\ncells = 3\ncell_size = 4\nread_heads = 2",
+        parameters: &[
+            ("lstm_layer_0.weight_ih_l0", "weight_input"),
+            ("lstm_layer_0.weight_hh_l0", "weight_state"),
+            ("lstm_layer_0.bias_ih_l0", "bias_input"),
+            ("lstm_layer_0.bias_hh_l0", "bias_state"),
+            ("rnn_layer_memory_shared.interface_weights.weight", "weight_interface"),
+            ("rnn_layer_memory_shared.interface_weights.bias", "bias_interface"),
+            ("output.weight", "weight_output"),
+            ("output.bias", "bias_output"),
+        ],
+        identities: &[],
+        zeros: &[],
+        final_state: as_recorded,
+    },
+    Case {
+        name: "fart",
+        options: "hidden_size = 4\nkey_size = 4",
+        parameters: ATTENTION,
+        identities: &["output.weight"],
+        zeros: &["output.bias"],
+        final_state: as_recorded,
+    },
+    Case {
+        name: "fwp",
+        options: "hidden_size = 4\nkey_size = 4",
+        parameters: ATTENTION,
+        identities: &["output.weight"],
+        zeros: &["output.bias"],
+        final_state: as_recorded,
+    },
+    Case {
+        name: "tcn",
+        options: "hidden_size = 8",
+        parameters: &[("weight", "weight"), ("bias", "bias")],
+        identities: &[],
+        zeros: &[],
+        final_state: as_recorded,
+    },
+];
+
+/// The block of `fart` and `fwp`, but for the projection after it.
+const ATTENTION: &[(&str, &str)] = &[
+    ("norm.weight", "norm_weight"),
+    ("norm.bias", "norm_bias"),
+    ("key.weight", "key"),
+    ("query.weight", "query"),
+    ("value.weight", "value"),
+    ("ff.0.weight", "first.weight"),
+    ("ff.0.bias", "first.bias"),
+    ("ff.2.weight", "second.weight"),
+    ("ff.2.bias", "second.bias"),
+    ("shortcut.weight", "shortcut.weight"),
+    ("shortcut.bias", "shortcut.bias"),
+];
 
 fn tensor(value: &Value) -> Tensor {
     fn walk(value: &Value, depth: usize, shape: &mut Vec<i64>, numbers: &mut Vec<f64>) {

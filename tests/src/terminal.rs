@@ -50,7 +50,11 @@ impl Terminal {
     pub fn start(name: &str, command: Command, (columns, rows): (u16, u16)) -> Self {
         let (pty, pts) = pty_process::blocking::open().expect("a pseudo-terminal");
         pty.resize(Size::new(rows, columns)).expect("a size");
-        let mut command = pty_process::blocking::Command::from(command).env("TERM", "xterm-256color");
+        // A backtrace would push what is looked for off the screen.
+        let mut command = pty_process::blocking::Command::from(command)
+            .env("TERM", "xterm-256color")
+            .env_remove("RUST_BACKTRACE")
+            .env_remove("RUST_LIB_BACKTRACE");
         let child = command.spawn_borrowed(&pts).unwrap_or_else(|error| panic!("cannot start {name}: {error}"));
         let parser = vt100::Parser::new(length(rows), length(columns), 0);
         let (pty, parser) = (Arc::new(pty), Arc::new(Mutex::new(parser)));

@@ -24,7 +24,7 @@ const BASELINE_BUDGET: Duration = Duration::from_secs(1);
 pub fn list(args: &ListArgs, extensions: &Extensions) -> Outcome {
     let text = match args.what {
         Listed::Envs => envs(&extensions.envs, args.json)?,
-        Listed::Memories => memories(&extensions.memories, args.json),
+        Listed::Memories => memories(&extensions.memories, args.json)?,
         Listed::Presets => presets(args.json),
     };
     say(text.trim_end())?;
@@ -37,16 +37,31 @@ fn envs(envs: &Registry, json: bool) -> anyhow::Result<String> {
     Ok(if json { pretty(both.map(|(entry, baseline)| env_json(entry, baseline))) } else { table(both) })
 }
 
-fn memories(memories: &memory::Registry, json: bool) -> String {
-    let entries = memories.entries().iter();
+fn memories(memories: &memory::Registry, json: bool) -> anyhow::Result<String> {
+    let sized: Vec<(&memory::Entry, memory::Sizes)> = memories
+        .entries()
+        .iter()
+        .map(|entry| Ok((entry, entry.sizes(popgym_models::policy::WIDTH, &toml::Table::new())?)))
+        .collect::<anyhow::Result<_>>()?;
     if json {
-        pretty(entries.map(|entry| {
+        return Ok(pretty(sized.iter().map(|(entry, sizes)| {
             let options = entry.resolve(&toml::Table::new()).unwrap_or_default();
-            json!({ "name": entry.name, "paper_name": entry.paper_name, "options": options })
-        }))
-    } else {
-        lines(entries.map(|entry| (entry.name, entry.paper_name)))
+            json!({
+                "name": entry.name,
+                "paper_name": entry.paper_name,
+                "paper": entry.paper,
+                "state": sizes.state,
+                "parameters": sizes.parameters,
+                "options": options,
+            })
+        })));
     }
+    let mut rows = vec![["NAME", "IN POPGYM", "STATE", "PARAMETERS", "PAPER"].map(str::to_owned)];
+    rows.extend(sized.iter().map(|(entry, sizes)| {
+        [entry.name, entry.paper_name, &sizes.state.to_string(), &sizes.parameters.to_string(), entry.paper]
+            .map(str::to_owned)
+    }));
+    Ok(aligned(&rows, room()))
 }
 
 fn presets(json: bool) -> String {
@@ -90,8 +105,12 @@ fn baselines(envs: &Registry) -> anyhow::Result<Vec<Baseline>> {
 fn table<'a>(envs: impl Iterator<Item = (&'a Entry, &'a Baseline)>) -> String {
     let mut rows = vec![HEADER.map(str::to_owned)];
     rows.extend(envs.map(|(entry, baseline)| row(entry, baseline)));
-    let room = if stdout().is_terminal() { crate::screen::terminal::Terminal::size().columns } else { usize::MAX };
-    aligned(&rows, room)
+    aligned(&rows, room())
+}
+
+/// Columns of the terminal; without one there is room for all.
+fn room() -> usize {
+    if stdout().is_terminal() { crate::screen::terminal::Terminal::size().columns } else { usize::MAX }
 }
 
 const COLUMNS: usize = 8;
@@ -127,8 +146,8 @@ fn short(x: f64) -> String {
 
 /// The rows with columns as wide as their widest cell. Where `room` columns are not enough for one line a row, each row has
 /// as many as it needs.
-fn aligned(rows: &[[String; COLUMNS]], room: usize) -> String {
-    let widths: [usize; COLUMNS] = std::array::from_fn(|i| rows.iter().map(|row| row[i].len()).max().unwrap_or(0));
+fn aligned<const N: usize>(rows: &[[String; N]], room: usize) -> String {
+    let widths: [usize; N] = std::array::from_fn(|i| rows.iter().map(|row| row[i].len()).max().unwrap_or(0));
     // Where each line begins.
     let (mut starts, mut length) = (vec![0], widths[0]);
     for (i, width) in widths.into_iter().enumerate().skip(1) {
@@ -141,7 +160,7 @@ fn aligned(rows: &[[String; COLUMNS]], room: usize) -> String {
     let mut text = String::new();
     for row in rows {
         for (i, &start) in starts.iter().enumerate() {
-            let end = starts.get(i + 1).copied().unwrap_or(COLUMNS);
+            let end = starts.get(i + 1).copied().unwrap_or(N);
             let cells = (start..end).map(|column| format!("{:<1$}", row[column], widths[column]));
             let indent = " ".repeat(if i == 0 { 0 } else { INDENT });
             text += format!("{indent}{}", cells.collect::<Vec<_>>().join(&" ".repeat(GAP))).trim_end();

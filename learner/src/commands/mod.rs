@@ -7,12 +7,14 @@ use crate::args::Which;
 use crate::checkpoint::{self, Checkpoint};
 
 mod eval;
+mod export;
 mod list;
 mod play;
 mod train;
 mod watch;
 
 pub use eval::eval;
+pub use export::export;
 pub use list::list;
 pub use play::play;
 pub use train::{resume, train};

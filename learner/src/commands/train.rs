@@ -11,6 +11,7 @@ use crate::checkpoint::Checkpoint;
 use crate::config::{self, Config};
 use crate::files;
 use crate::interrupt::{EXIT_INTERRUPTED, Interrupt};
+use crate::manifest;
 use crate::observer::{
     Curve, MetricsCsv, Observer, Progress, Prometheus, RunStart, Summary, SummaryJson, TensorBoard, TimingCsv,
 };
@@ -112,6 +113,7 @@ fn carry_out(dir: &RunDir, mut session: Session<'_>, config: &Config, extensions
     let trainer = Trainer {
         config,
         action: session.env().action.clone(),
+        about: manifest::describe(config, session.env(), &policy),
         policy,
         behaviour,
         service: session.service()?,

@@ -38,27 +38,27 @@ fn check(tensor: &Tensor) {
 /// Defines a function that runs `$body`, an `#[inline(always)]` function, compiled for the widest vectors that the machine
 /// has.
 macro_rules! widest {
-    ($(#[$attribute:meta])* fn $name:ident($($argument:ident: $kind:ty),* $(,)?) = $body:path) => {
+    ($(#[$attribute:meta])* fn $name:ident $(<$generic:ident: $bound:ident>)? ($($argument:ident: $kind:ty),* $(,)?) = $body:path) => {
         $(#[$attribute])*
         #[allow(unsafe_code)]
-        fn $name($($argument: $kind),*) {
+        fn $name $(<$generic: $bound>)? ($($argument: $kind),*) {
             #[cfg(target_arch = "x86_64")]
             {
                 #[target_feature(enable = "avx512f")]
-                fn avx512($($argument: $kind),*) {
+                fn avx512 $(<$generic: $bound>)? ($($argument: $kind),*) {
                     $body($($argument),*);
                 }
                 #[target_feature(enable = "avx2")]
-                fn avx2($($argument: $kind),*) {
+                fn avx2 $(<$generic: $bound>)? ($($argument: $kind),*) {
                     $body($($argument),*);
                 }
                 if std::arch::is_x86_feature_detected!("avx512f") {
                     // SAFETY: the machine has these instructions.
-                    return unsafe { avx512($($argument),*) };
+                    return unsafe { avx512 $(::<$generic>)? ($($argument),*) };
                 }
                 if std::arch::is_x86_feature_detected!("avx2") {
                     // SAFETY: the machine has these instructions.
-                    return unsafe { avx2($($argument),*) };
+                    return unsafe { avx2 $(::<$generic>)? ($($argument),*) };
                 }
             }
             $body($($argument),*);

@@ -7,7 +7,7 @@
 //! h' = (1 - q) * n + q * h,    y = h'
 //! ```
 //!
-//! On CUDA this is cuDNN's; on the CPU see `gru_cpu.rs`.
+//! On CUDA this is cuDNN's; on the CPU see `recurrent_cpu.rs`.
 //!
 //! `weight_input [3 hidden, inputs]` and `weight_state [3 hidden, hidden]` hold the gates in the order r, q, n. State:
 //! `h [rows, hidden]`.
@@ -16,7 +16,8 @@ use tch::nn::Path;
 use tch::{Device, Kind, Tensor};
 
 use super::elementwise::on_cpu;
-use super::{HiddenSize, Memory, MemoryKind, Scan, State, gru_cpu};
+use super::gru_cpu::GruCell;
+use super::{HiddenSize, Memory, MemoryKind, Scan, State, recurrent_cpu};
 use crate::init::uniform;
 use crate::packing::Packing;
 
@@ -75,16 +76,14 @@ impl Memory for Gru {
         if !on_cpu(input) {
             return tch::no_grad(|| self.step(input, state));
         }
-        let next = gru_cpu::step(self.parameters(), input, &state.0[0]);
-        (next.shallow_clone(), State(vec![next]))
+        recurrent_cpu::step::<GruCell>(self.parameters(), input, state)
     }
 
     fn scan(&self, input: &Tensor, packing: &Packing, state: &State) -> Scan {
-        let state = &state.0[0];
         if on_cpu(input) {
-            return gru_cpu::scan(self.parameters(), input, packing, state);
+            return recurrent_cpu::scan::<GruCell>(self.parameters(), input, packing, state);
         }
-        let (batch_sizes, initial) = (packing.batch_sizes_tensor(), state.unsqueeze(0));
+        let (batch_sizes, initial) = (packing.batch_sizes_tensor(), state.0[0].unsqueeze(0));
         let (output, last) =
             Tensor::gru_data(input, &batch_sizes, &initial, &self.parameters(), true, 1, 0.0, true, false);
         Scan { output, state: State(vec![last.squeeze_dim(0)]), computed_steps: packing.rows(), backward: None }

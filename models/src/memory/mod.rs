@@ -12,21 +12,40 @@ use std::sync::Arc;
 
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
-use tch::nn::Path;
+use tch::nn::{Path, VarStore};
 use tch::{Device, Tensor};
 
 use crate::ModelError;
 use crate::packing::Packing;
 
+mod dnc;
 mod elementwise;
+mod elman;
+mod elman_cpu;
+mod fart;
+mod frame_stack;
+mod fwp;
 mod gru;
 mod gru_cpu;
+mod linear_attention;
+mod lstm;
+mod lstm_cpu;
 mod mlp;
 mod pos_mlp;
+mod recurrent_cpu;
+mod tcn;
+mod windows;
 
+pub use dnc::{Dnc, DncOptions};
+pub use elman::Elman;
+pub use fart::{Fart, FartOptions};
+pub use frame_stack::{FrameStack, FrameStackOptions};
+pub use fwp::{Fwp, FwpOptions};
 pub use gru::Gru;
+pub use lstm::Lstm;
 pub use mlp::Mlp;
 pub use pos_mlp::PosMlp;
+pub use tcn::{Tcn, TcnOptions};
 
 /// The recurrent state of a batch: tensors with one row a sequence (`[rows, ...]`).
 #[derive(Debug, Default)]
@@ -167,6 +186,15 @@ pub trait MemoryKind: Memory + Sized + 'static {
     fn new(path: &Path<'_>, input_width: i64, options: &Self::Options) -> Result<Self, String>;
 }
 
+/// How large a memory is.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Sizes {
+    /// Numbers that are learned.
+    pub parameters: usize,
+    /// Numbers that one sequence carries from step to step.
+    pub state: usize,
+}
+
 type Build = dyn Fn(&Path<'_>, i64, &toml::Table) -> Result<Box<dyn Memory>, String> + Send + Sync;
 type Resolve = dyn Fn(&toml::Table) -> Result<toml::Table, String> + Send + Sync;
 
@@ -205,6 +233,20 @@ impl Entry {
         (self.build)(path, input_width, options).map_err(|problem| self.options_error(problem))
     }
 
+    /// How large the memory is with these options.
+    ///
+    /// # Errors
+    /// The option that is wrong.
+    pub fn sizes(&self, input_width: i64, options: &toml::Table) -> Result<Sizes, ModelError> {
+        let store = VarStore::new(Device::Cpu);
+        let memory = self.build(&store.root(), input_width, options)?;
+        let numbers = |tensors: &[Tensor]| tensors.iter().map(Tensor::numel).sum();
+        Ok(Sizes {
+            parameters: numbers(&store.trainable_variables()),
+            state: numbers(&memory.initial_state(1, Device::Cpu).0),
+        })
+    }
+
     fn options_error(&self, problem: String) -> ModelError {
         ModelError::MemoryOptions { memory: self.name.to_owned(), problem }
     }
@@ -222,7 +264,14 @@ impl Registry {
         let mut registry = Self::default();
         registry.register::<Mlp>();
         registry.register::<PosMlp>();
+        registry.register::<Elman>();
+        registry.register::<Lstm>();
         registry.register::<Gru>();
+        registry.register::<Dnc>();
+        registry.register::<Fart>();
+        registry.register::<Fwp>();
+        registry.register::<FrameStack>();
+        registry.register::<Tcn>();
         registry
     }
 

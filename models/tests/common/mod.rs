@@ -86,13 +86,16 @@ pub fn sequences(lengths: &[i64], width: i64) -> Vec<Tensor> {
     lengths.iter().map(|&length| random(length, width)).collect()
 }
 
-/// One sequence, step by step, as a batch of one row.
-pub fn by_steps(memory: &dyn Memory, sequence: &Tensor) -> (Tensor, State) {
+/// One sequence step by step, as a batch of one row.
+pub fn by_steps(
+    sequence: &Tensor,
+    mut state: State,
+    step: impl Fn(&Tensor, &State) -> (Tensor, State),
+) -> (Tensor, State) {
     tch::no_grad(|| {
-        let mut state = memory.initial_state(1, Device::Cpu);
         let mut outputs = Vec::new();
         for t in 0..sequence.size()[0] {
-            let (output, next) = memory.step(&sequence.narrow(0, t, 1), &state);
+            let (output, next) = step(&sequence.narrow(0, t, 1), &state);
             outputs.push(output);
             state = next;
         }
@@ -128,9 +131,14 @@ pub fn take_gradients(parameters: &BTreeMap<String, Tensor>) -> BTreeMap<String,
 pub fn assert_gradients_close(a: &BTreeMap<String, Tensor>, b: &BTreeMap<String, Tensor>, relative: f64, what: &str) {
     assert!(a.keys().eq(b.keys()));
     for (name, gradient) in a {
-        assert!(largest(&b[name]) > 0.0, "{what}: {name}'s gradient is zero");
-        let scale = largest(&b[name]);
-        let difference = largest(&(gradient - &b[name]));
-        assert!(difference <= relative * scale, "{what}: {name} differs by {difference:e} at a scale of {scale}");
+        assert_gradient_close(gradient, &b[name], relative, &format!("{what}: {name}"));
     }
+}
+
+/// `|a - b| <= relative |b|`, with the largest |b|, which may not be zero.
+pub fn assert_gradient_close(a: &Tensor, b: &Tensor, relative: f64, what: &str) {
+    assert_eq!(a.size(), b.size(), "{what}");
+    let (difference, scale) = (largest(&(a - b)), largest(b));
+    assert!(scale > 0.0, "{what}: the gradient is zero");
+    assert!(difference <= relative * scale, "{what}: gradients differ by {difference:e} at a scale of {scale}");
 }
