@@ -405,6 +405,7 @@ def serve(bench):
     for line in sys.stdin:
         request = json.loads(line)
         bench.use(request["memory"])
+        assert request["parameters"] == PARAMETERS[request["memory"]], f"not the same work: {request}"
         if "rows" in request:
             times = bench.steps(request["rows"], request["seconds"])
         else:
