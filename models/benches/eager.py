@@ -382,7 +382,7 @@ class Bench:
         times, begun = [], self.now()
         while not times or self.now() - begun < seconds:
             state, start, count = self.memory.start(x), self.now(), 0
-            while count < EPISODE and (count % 16 or time.perf_counter() - start < seconds):
+            while count == 0 or count < EPISODE and (count % 16 or time.perf_counter() - start < seconds):
                 _, state = self.memory.step(x, state)
                 count += 1
             times.append((self.now() - start) / count)
@@ -405,6 +405,7 @@ def serve(bench):
     for line in sys.stdin:
         request = json.loads(line)
         bench.use(request["memory"])
+        assert request["parameters"] == PARAMETERS[request["memory"]], f"not the same work: {request}"
         if "rows" in request:
             times = bench.steps(request["rows"], request["seconds"])
         else:

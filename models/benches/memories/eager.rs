@@ -42,6 +42,8 @@ struct Request<'a> {
     memory: &'a str,
     #[serde(flatten)]
     work: Work,
+    /// Both sides must have as many.
+    parameters: usize,
     seconds: f64,
 }
 
@@ -81,15 +83,17 @@ impl Eager {
         Ok(Self { process, requests, answers })
     }
 
-    /// Median seconds of a pass or step, after `seconds` of them.
-    fn time(&mut self, memory: &str, work: Work, seconds: f64) -> Result<f64, String> {
-        let mut line = serde_json::to_string(&Request { memory, work, seconds }).expect("plain data");
+    /// Median seconds of a pass or step.
+    fn time(&mut self, request: &Request<'_>) -> Result<f64, String> {
+        let mut line = serde_json::to_string(request).expect("plain data");
         line.push('\n');
         let sent = self.requests.as_mut().map_or(Ok(()), |requests| requests.write_all(line.as_bytes()));
         line.clear();
         let received = sent.and_then(|()| self.answers.read_line(&mut line));
         let answer: Option<Answer> = received.ok().and_then(|_| serde_json::from_str(&line).ok());
-        answer.map(|answer| answer.seconds).ok_or_else(|| format!("eager.py gave no answer for {memory}; see above"))
+        answer
+            .map(|answer| answer.seconds)
+            .ok_or_else(|| format!("eager.py gave no answer for {}; see above", request.memory))
     }
 }
 
@@ -110,6 +114,7 @@ impl Comparison {
         rounds: usize,
         seconds: f64,
     ) -> Result<Self, String> {
+        let parameters = subject.parameters();
         let mut here: Box<dyn FnMut(f64) -> f64> = match work {
             Work::Pass(shape) => {
                 let batch = subject.batch(shape);
@@ -125,7 +130,11 @@ impl Comparison {
             // Neither is always first.
             for turn in [round % 2, 1 - round % 2] {
                 std::thread::sleep(REST);
-                times[turn] = if turn == 0 { here(seconds) } else { eager.time(memory, work, seconds)? };
+                times[turn] = if turn == 0 {
+                    here(seconds)
+                } else {
+                    eager.time(&Request { memory, work, parameters, seconds })?
+                };
             }
             if round > 0 {
                 ours.push(times[0]);

@@ -27,6 +27,9 @@
 //! them, so that whatever else the machine does meets both; rates are medians over the turns, the ratio is the median of
 //! each turn's (above 1: faster than eager). steps/s are rows a second.
 //!
+//! libtorch's threads wait for one another without sleeping: on a machine with other work, training on all cores takes many
+//! times its time unless OMP_WAIT_POLICY=passive is set (for both sides).
+//!
 //! Without cargo's `--bench` (under `cargo test --all-targets`) it only runs everything once, at a tiny size.
 
 mod arithmetic;
@@ -56,12 +59,14 @@ fn main() -> ExitCode {
     let arguments: Vec<String> = std::env::args().skip(1).collect();
     let done = match arguments.split_first() {
         Some((first, rest)) if first == peak::ARGUMENT => peak::child(rest),
-        _ => Options::parse(&arguments).and_then(|options| match options {
-            Some(options) => run(&options),
-            None => {
-                println!("{USAGE}");
-                Ok(())
-            }
+        _ => Options::parse(&arguments).and_then(|options| {
+            options.map_or_else(
+                || {
+                    println!("{USAGE}");
+                    Ok(())
+                },
+                |options| run(&options),
+            )
         }),
     };
     match done {

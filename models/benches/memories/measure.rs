@@ -119,7 +119,7 @@ impl Subject {
             let mut state = self.memory.initial_state(rows, device);
             let (start, mut count) = (self.now(), 0);
             // Many steps for each look at the clock.
-            while count < EPISODE && (count % 16 > 0 || start.elapsed().as_secs_f64() < seconds) {
+            while count == 0 || count < EPISODE && (count % 16 > 0 || start.elapsed().as_secs_f64() < seconds) {
                 (_, state) = self.memory.act(&input, &state);
                 count += 1;
             }

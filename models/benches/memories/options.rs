@@ -10,8 +10,7 @@ use serde::Serialize;
 use tch::Device;
 
 /// What [`Options::parse`] understands.
-pub(crate) const USAGE: &str = "\
-  --memories NAME,...   which memories (default: all)
+pub(crate) const USAGE: &str = "  --memories NAME,...   which memories (default: all)
   --shapes SxT,...      training batches: S sequences of T steps (default: 64x1024)
   --repeats N           measurements of each figure, 2 to 1000 (default: 10); --quick: 3
   --threads N           threads of training; a step on the CPU has one (default: all cores)
@@ -116,7 +115,7 @@ impl Options {
                 "--python" => options.python = Some(value()?.into()),
                 // What cargo's own test runner would take means nothing here.
                 _ if !measure => {}
-                _ => return Err(format!("unknown argument `{flag}`; allowed are\n{USAGE}")),
+                _ => return Err(format!("unknown argument `{flag}`; allowed are\n\n{USAGE}")),
             }
         }
         Ok(Some(options))
