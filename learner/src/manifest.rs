@@ -13,7 +13,8 @@ use crate::space_text::space_text;
 pub fn describe(config: &Config, env: &EnvSpec, policy: &Policy) -> Value {
     let shapes: serde_json::Map<String, Value> =
         policy.parameters().iter().map(|(name, tensor)| (name.clone(), json!(tensor.size()))).collect();
-    let state: Vec<Vec<i64>> = policy.initial_state(1).0.iter().map(|tensor: &Tensor| tensor.size()[1..].to_vec()).collect();
+    let state: Vec<Vec<i64>> =
+        policy.initial_state(1).0.iter().map(|tensor: &Tensor| tensor.size()[1..].to_vec()).collect();
     json!({
         "env": config.env,
         "memory": config.memory_name(),

@@ -89,9 +89,11 @@ pub fn update(
 
             adam.zero_grad();
             outputs.backward(&loss);
-            let grad_norm = adam
-                .step(schedule.learning_rate)
-                .map_err(|tensor| UpdateError::NotFinite { tensor, pass, minibatch: number })?;
+            let grad_norm = adam.step(schedule.learning_rate).map_err(|tensor| UpdateError::NotFinite {
+                tensor,
+                pass,
+                minibatch: number,
+            })?;
             let means = [&losses.policy, &losses.value, &losses.kl, &losses.entropy, &grad_norm];
             totals.add(&means, minibatch.packing.rows(), computed_steps);
         }

@@ -1,7 +1,7 @@
 //! First weights (reference: the paper's code; PyTorch's default for linear layers).
 
-use tch::nn::{Init, Path};
 use tch::Tensor;
+use tch::nn::{Init, Path};
 
 /// A linear layer `y = x W^T + b`.
 #[derive(Debug)]

@@ -126,7 +126,18 @@ impl Policy {
         let actor = Head::new(&(&root / "actor"), memory.output_width(), distribution.width() as i64);
         let critic = Head::new(&(&root / "critic"), memory.output_width(), 1);
         let parameters = store.variables().into_iter().collect();
-        Ok(Self { store, parameters, encoder, projection, positional, preprocessor, memory, actor, critic, distribution })
+        Ok(Self {
+            store,
+            parameters,
+            encoder,
+            projection,
+            positional,
+            preprocessor,
+            memory,
+            actor,
+            critic,
+            distribution,
+        })
     }
 
     /// Where the weights are.

@@ -37,7 +37,7 @@ pub(super) fn scan(parameters: &Parameters, input: &Tensor, packing: &Packing, i
         let g = combined(p);
         // Not copied: products with a transposed view add up in another order, and are several times as accurate.
         let [window, w_h, w_m] = [&p.window, &p.weight_state, &p.weight_memory].map(Tensor::tr);
-        let mut v = Trajectory::new(packing, &Tensor::cat(&[&initial.0[1], &initial.0[0]], 1));
+        let v = Trajectory::new(packing, &Tensor::cat(&[&initial.0[1], &initial.0[0]], 1));
         let _ = v.after().narrow(1, 0, memory).zero_();
         let _ = v.after().narrow(1, memory, hidden).copy_(&input.mm(&parameters.weight_input.tr()));
         let u = dot(input, &p.encoder_input);
