@@ -170,8 +170,10 @@ impl Memory for Lmu {
         // Not as products with one column, whose bits would depend on the number of rows.
         let dot = |x: &Tensor, e: &Tensor| (x * e).sum_dim_intlist(1, true, None::<Kind>);
         let u = dot(input, &p.encoder_input) + dot(h, &p.encoder_state) + dot(m, &p.encoder_memory);
-        let m = m.mm(&window.tr()).addmm(&u, &window_input);
-        let h = input.mm(&p.weight_input.tr()).addmm(h, &p.weight_state.tr()).addmm(&m, &p.weight_memory.tr()).tanh();
+        let product = |x: &Tensor, weight: &Tensor| x.linear(weight, None::<&Tensor>);
+        let m = product(m, &window) + u * window_input;
+        let h = product(input, &p.weight_input) + product(h, &p.weight_state) + product(&m, &p.weight_memory);
+        let h = h.tanh();
         (h.shallow_clone(), State(vec![h, m]))
     }
 
