@@ -169,7 +169,7 @@ mod tests {
         for _ in 0..updates {
             adam.zero_grad();
             (x - target).square().sum(Kind::Float).backward();
-            adam.step(0.1).unwrap();
+            let _norm = adam.step(0.1).unwrap();
         }
     }
 

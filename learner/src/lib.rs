@@ -26,7 +26,7 @@ mod files;
 pub mod gae;
 pub mod interrupt;
 pub mod local_actors;
-mod manifest;
+pub mod manifest;
 pub mod observer;
 pub mod ppo_keys;
 pub mod run_dir;

@@ -131,8 +131,8 @@ fn forward_method(outputs: &[Width]) -> String {
     let mut start = 0;
     for (i, Width { columns, shape }) in outputs.iter().enumerate() {
         let end = start + columns;
-        let shape: String = shape.iter().map(|size| format!(", {size}")).collect();
-        let _ = writeln!(text, "    output_{i} = torch.reshape(torch.slice(flat, 1, {start}, {end}), [-1{shape}])");
+        let shape: Vec<i64> = [-1].into_iter().chain(shape.iter().copied()).collect();
+        let _ = writeln!(text, "    output_{i} = torch.reshape(torch.slice(flat, 1, {start}, {end}), {shape:?})");
         start = end;
     }
     let outputs: Vec<String> = (0..outputs.len()).map(|i| format!("output_{i}")).collect();

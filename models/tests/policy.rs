@@ -134,8 +134,8 @@ fn libtorch_keeps_rows_apart(x: &Tensor, rows: i64) -> bool {
 
 #[test]
 fn a_row_does_not_depend_on_the_others() {
-    tch::set_num_threads(1);
     const MOST: i64 = 256;
+    tch::set_num_threads(1);
     let wide = random(MOST, 256);
     for name in names() {
         let policy = small(name);

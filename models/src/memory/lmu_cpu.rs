@@ -39,7 +39,7 @@ pub(super) fn scan(parameters: &Parameters, input: &Tensor, packing: &Packing, i
         let [window, w_h, w_m] = [&p.window, &p.weight_state, &p.weight_memory].map(Tensor::tr);
         let v = Trajectory::new(packing, &Tensor::cat(&[&initial.0[1], &initial.0[0]], 1));
         let _ = v.after().narrow(1, 0, memory).zero_();
-        let _ = v.after().narrow(1, memory, hidden).copy_(&input.mm(&parameters.weight_input.tr()));
+        v.after().narrow(1, memory, hidden).copy_(&input.mm(&parameters.weight_input.tr()));
         let u = dot(input, &p.encoder_input);
         let steps = Step::all(packing);
         for step in &steps {
