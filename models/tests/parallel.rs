@@ -101,7 +101,7 @@ fn gradients_are_those_of_the_steps() {
         let x = x.to_kind(Kind::Double);
         let weight = Tensor::randn([packing.rows(), 12], (Kind::Double, Device::Cpu));
         let state = to_double(&wide.memory.initial_state(packing.sequences(), Device::Cpu));
-        let state = State(state.0.iter().map(|tensor| tensor.rand_like()).collect());
+        let state = State(state.0.iter().map(Tensor::rand_like).collect());
         let run = |steps: bool| {
             let x = x.detach().set_requires_grad(true);
             let scan = if steps {
@@ -334,7 +334,7 @@ fn s4d_acts_with_its_present_parameters() {
     let state = some_state(&*old.memory, 3, 6);
     let before = old.memory.act(&x, &state).0;
     tch::no_grad(|| {
-        let _ = old.parameters()["log_step"].shallow_clone().copy_(&new.parameters()["log_step"]);
+        old.parameters()["log_step"].shallow_clone().copy_(&new.parameters()["log_step"]);
     });
     assert!(largest(&(old.memory.act(&x, &state).0 - before)) > 1e-4);
     let fresh = old.wide("s4d", 6, "hidden_size = 8");

@@ -131,8 +131,8 @@ fn independent_recurrences_are_bounded() {
         for parameter in parameters.values() {
             let _ = parameter.shallow_clone().fill_(0.0);
         }
-        let _ = parameters["first_recurrent"].shallow_clone().copy_(&Tensor::from_slice(&[5.0_f32, 0.5]));
-        let _ = parameters["weight_between"].shallow_clone().copy_(&Tensor::eye(2, FLOAT));
+        parameters["first_recurrent"].shallow_clone().copy_(&Tensor::from_slice(&[5.0_f32, 0.5]));
+        parameters["weight_between"].shallow_clone().copy_(&Tensor::eye(2, FLOAT));
     });
     let state = State(vec![Tensor::ones([1, 2], FLOAT), Tensor::zeros([1, 2], FLOAT)]);
     let x = Tensor::zeros([1024, 3], FLOAT).set_requires_grad(true);
@@ -140,11 +140,12 @@ fn independent_recurrences_are_bounded() {
     // Kept from exploding, a state doubles in 1024 steps.
     assert!((scan.output.double_value(&[1023, 0]) - 2.0).abs() < 1e-3);
     assert!((scan.output.double_value(&[0, 0]) - bound).abs() < 1e-6);
-    assert_eq!(scan.output.double_value(&[1, 1]), 0.25);
-    assert_eq!(parameters["first_recurrent"].double_value(&[0]), 5.0, "the parameter itself is left alone");
+    assert!((scan.output.double_value(&[1, 1]) - 0.25).abs() < 1e-7);
+    let kept = parameters["first_recurrent"].double_value(&[0]);
+    assert!((kept - 5.0).abs() < 1e-7, "the parameter itself is left alone");
     let _ = scan.backward.unwrap()(&Tensor::ones([1024, 2], FLOAT));
     let gradient = parameters["first_recurrent"].grad();
-    assert_eq!(gradient.double_value(&[0]), 0.0, "beyond the bound there is no gradient");
+    assert!(gradient.double_value(&[0]).abs() < 1e-9, "beyond the bound there is no gradient");
     // d sum of u^t / du for t = 1, 2, ... is 1 / (1 - u)^2.
     assert!((gradient.double_value(&[1]) - 4.0).abs() < 1e-5);
 }
