@@ -100,7 +100,7 @@ impl Report {
     /// Training beside eager, and steps beside eager, as Markdown.
     pub(crate) fn comparison(&self) -> String {
         let head = |columns: &[&str]| vec![columns.iter().map(|&column| column.to_owned()).collect::<Vec<_>>()];
-        let mut passes = head(&["memory", "batch", "passes/s", "eager", "ratio", "GFLOP", "of peak"]);
+        let mut passes = head(&["memory", "batch", "batches/s", "eager", "ratio", "GFLOP", "of peak"]);
         let mut steps = head(&["memory", "rows", "steps/s", "eager", "ratio"]);
         for comparison in &self.comparisons {
             let Some(figures) = self.memories.iter().find(|figures| figures.name == comparison.memory) else {
