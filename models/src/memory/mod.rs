@@ -43,6 +43,7 @@ mod pos_mlp;
 mod recurrent_cpu;
 mod s4d;
 mod s4d_cpu;
+mod s4d_scan_cpu;
 mod tcn;
 mod trajectory;
 mod windows;
