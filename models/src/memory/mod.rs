@@ -42,6 +42,7 @@ mod mlp;
 mod pos_mlp;
 mod recurrent_cpu;
 mod s4d;
+mod s4d_block_cpu;
 mod s4d_cpu;
 mod s4d_scan_cpu;
 mod tcn;
