@@ -55,15 +55,19 @@ fn some_state(memory: &dyn Memory, sequences: i64, width: i64) -> State {
 
 /// Gradients of sum(output weight), input first.
 fn gradients(
-    scan: &Scan,
+    scan: &mut Scan,
     weight: &Tensor,
     input: &Tensor,
     parameters: &BTreeMap<String, Tensor>,
 ) -> BTreeMap<String, Tensor> {
-    assert!(scan.backward.is_none());
-    (&scan.output * weight).sum(None::<Kind>).backward();
+    let input = if let Some(backward) = scan.backward.take() {
+        backward(weight)
+    } else {
+        (&scan.output * weight).sum(None::<Kind>).backward();
+        input.grad()
+    };
     let mut gradients = take_gradients(parameters);
-    gradients.insert("(input)".to_owned(), input.grad());
+    gradients.insert("(input)".to_owned(), input);
     gradients
 }
 
@@ -104,12 +108,12 @@ fn gradients_are_those_of_the_steps() {
         let state = State(state.0.iter().map(Tensor::rand_like).collect());
         let run = |steps: bool| {
             let x = x.detach().set_requires_grad(true);
-            let scan = if steps {
+            let mut scan = if steps {
                 scan_by_steps(&*wide.memory, &x, &packing, &state)
             } else {
                 wide.memory.scan(&x, &packing, &state)
             };
-            (gradients(&scan, &weight, &x, &parameters), scan)
+            (gradients(&mut scan, &weight, &x, &parameters), scan)
         };
         let ((found, scan), (expected, steps)) = (run(false), run(true));
         assert_gradients_close(&found, &expected, 1e-9, name);
@@ -132,8 +136,8 @@ fn gradients_in_f32_are_near_those_in_f64() {
             let x = x.to_kind(kind).detach().set_requires_grad(true);
             let state = built.memory.initial_state(packing.sequences(), Device::Cpu);
             let state = State(state.0.iter().map(|tensor| tensor.to_kind(kind)).collect());
-            let scan = built.memory.scan(&x, &packing, &state);
-            gradients(&scan, &weight.to_kind(kind), &x, &built.parameters())
+            let mut scan = built.memory.scan(&x, &packing, &state);
+            gradients(&mut scan, &weight.to_kind(kind), &x, &built.parameters())
         };
         assert_gradients_close(&run(&built, Kind::Float), &run(&wide, Kind::Double), 1e-4, name);
     }
@@ -343,4 +347,61 @@ fn s4d_acts_with_its_present_parameters() {
     assert_close(&old.memory.step(&x, &state).0.detach(), &expected, 1e-5, "step");
     let scan = old.memory.scan(&x, &Packing::new(&[1, 1, 1]), &state);
     assert_close(&scan.output.detach(), &expected, 1e-5, "scan");
+}
+
+/// Its loop over time in f32, gradients included, against the steps in f64: channels that do and do not fill a vector.
+#[test]
+fn s4ds_loop_is_the_steps_for_any_size() {
+    for (hidden, state_size) in [(1, 2), (19, 16), (33, 20), (64, 2), (97, 16)] {
+        let options = format!("hidden_size = {hidden}\nstate_size = {state_size}");
+        let built = Built::new("s4d", 10, &options);
+        let wide = built.wide("s4d", 10, &options);
+        let (packing, x) = pack(&sequences(&[65, 1, 140, 32, 2, 33, 31, 64], 10));
+        let state = some_state(&*built.memory, packing.sequences(), 10);
+        let weight = random(packing.rows(), hidden);
+        let x = x.set_requires_grad(true);
+        let mut scan = built.memory.scan(&x, &packing, &state);
+        assert!(scan.backward.is_some() && !scan.output.requires_grad());
+        let found = gradients(&mut scan, &weight, &x, &built.parameters());
+        let x = x.to_kind(Kind::Double).detach().set_requires_grad(true);
+        let mut exact = scan_by_steps(&*wide.memory, &x, &packing, &to_double(&state));
+        let expected = gradients(&mut exact, &weight.to_kind(Kind::Double), &x, &wide.parameters());
+        assert_gradients_close(&found, &expected, 1e-4, &options);
+        assert_close(&scan.output, &exact.output, 1e-5, &options);
+        for (found, expected) in scan.state.0.iter().zip(&exact.state.0) {
+            assert_close(found, expected, 1e-5, &options);
+        }
+    }
+}
+
+#[test]
+fn s4ds_frozen_parameters_get_no_gradient() {
+    let built = Built::new("s4d", 10, SMALL);
+    let parameters = built.parameters();
+    let (packing, x) = pack(&sequences(&[40, 3], 10));
+    let weight = random(packing.rows(), 12);
+    let run = || {
+        let grad_input = scan_gradient(&*built.memory, &x, &packing, &weight);
+        (grad_input, parameters.iter().filter(|(_, x)| x.grad().defined()).map(|(name, _)| name.as_str()).collect())
+    };
+    let mut learned: Vec<&str> = parameters.keys().map(String::as_str).collect();
+    let order = ["log_step", "state_input", "frequency", "skip", "log_decay", "state_output"];
+    let order = order.iter().chain(&["output.weight", "input.bias", "input.weight", "output.bias"]);
+    let (expected, all): (Tensor, Vec<&str>) = run();
+    assert_eq!(all, learned);
+    for frozen in order {
+        for parameter in parameters.values() {
+            parameter.shallow_clone().zero_grad();
+        }
+        let _ = parameters[*frozen].set_requires_grad(false);
+        let before = parameters[*frozen].grad().copy();
+        learned.retain(|name| name != frozen);
+        let grad_input = run().0;
+        assert_same_bits(&grad_input, &expected, frozen);
+        assert_same_bits(&parameters[*frozen].grad(), &before, frozen);
+        for name in &learned {
+            assert!(largest(&parameters[*name].grad()) > 0.0, "{name} without {frozen}");
+        }
+    }
+    assert!(learned.is_empty());
 }

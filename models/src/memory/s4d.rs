@@ -15,7 +15,8 @@
 //! parts), `skip, log_step [hidden]` (D, d), `input.weight [hidden, inputs]`, `output.weight [2 hidden, hidden]`.
 //! State: real and imaginary part of s, `[rows, hidden, modes]` each.
 //!
-//! A scan cuts sequences into chunks of l steps. Within a chunk the system is a convolution with
+//! On the CPU a scan is a loop over time between two products of all rows (`s4d_scan_cpu.rs`). Elsewhere, where many small
+//! operators cost more, it cuts sequences into chunks of l steps. Within a chunk the system is a convolution with
 //! `K[j] = 2 Re(sum_n C_n Bbar_n Abar_n^j)`, one `[l, l]` matrix a channel; the state goes from chunk to chunk:
 //!
 //! ```text
@@ -31,7 +32,7 @@ use tch::nn::{Init, Path};
 use tch::{Device, Kind, Tensor};
 
 use super::elementwise::on_cpu;
-use super::{Memory, MemoryKind, Scan, State, s4d_cpu};
+use super::{Memory, MemoryKind, Scan, State, s4d_cpu, s4d_scan_cpu};
 use crate::chunks::Chunks;
 use crate::init::{Linear, uniform};
 use crate::packing::Packing;
@@ -142,6 +143,17 @@ impl S4d {
         (Complex { re: &size * cos, im: size * sin }, b)
     }
 
+    /// What the loop over time on the CPU needs.
+    fn layers(&self, with_graph: bool) -> s4d_scan_cpu::Layers {
+        let system = || {
+            let (a, b) = self.discretise();
+            let c = Complex::of_pairs(&self.state_output).map(|part| part * 2.0);
+            Tensor::cat(&[a.re, a.im, b.re, b.im, c.re, c.im, self.skip.unsqueeze(1)], 1)
+        };
+        let [input, output] = [&self.input, &self.output].map(|layer| layer.parameters().map(Tensor::shallow_clone));
+        s4d_scan_cpu::Layers { input, output, system: if with_graph { system() } else { tch::no_grad(system) } }
+    }
+
     /// `v [rows, hidden]` to the output.
     fn finish(&self, v: &Tensor) -> Tensor {
         self.output.forward(&v.gelu("none")).glu(1)
@@ -250,6 +262,9 @@ impl Memory for S4d {
     }
 
     fn scan(&self, input: &Tensor, packing: &Packing, state: &State) -> Scan {
+        if on_cpu(input) {
+            return s4d_scan_cpu::scan(self.layers(input.requires_grad()), input, packing, state);
+        }
         let chunks = Chunks::new(packing, CHUNK, input.device());
         let system = self.chunk_system(chunks.size());
         let [weight, bias] = self.input.parameters();
