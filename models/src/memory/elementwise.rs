@@ -12,6 +12,10 @@ use tch::{Device, Kind, Tensor};
 #[allow(unsafe_code)]
 pub(super) fn floats(tensor: &Tensor) -> &[f32] {
     check(tensor);
+    if tensor.numel() == 0 {
+        // Its pointer may be null.
+        return &[];
+    }
     // SAFETY: `check` made sure that `numel` f32 numbers lie at `data_ptr`; they live as long as the tensor does. Tensors
     // may share numbers; the loops over time, the only callers, hold slices of disjoint rows, and only between libtorch's
     // calls.
@@ -22,6 +26,9 @@ pub(super) fn floats(tensor: &Tensor) -> &[f32] {
 #[allow(unsafe_code)]
 pub(super) fn floats_mut(tensor: &mut Tensor) -> &mut [f32] {
     check(tensor);
+    if tensor.numel() == 0 {
+        return &mut [];
+    }
     // SAFETY: as in `floats`.
     unsafe { std::slice::from_raw_parts_mut(tensor.data_ptr().cast(), tensor.numel()) }
 }
