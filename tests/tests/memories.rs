@@ -125,7 +125,7 @@ fn a_memorys_options_are_checked() {
         ("lmu", "theta = 0", "`theta` is 0, allowed is 1..=65536"),
         ("dnc", "read_heads = 0", "`read_heads` is 0, allowed is 1..=64"),
         ("tcn", "kernel = 4", "unknown key `memory.kernel`; did you mean"),
-        ("s4d", "state_size = 3", "`state_size` is 3, allowed is an even number in 2..=1024"),
+        ("s4d", "state_size = 3", "`state_size` is 3, allowed is an even number of 2..=1024"),
     ] {
         scene.write("memory.toml", &format!("[memory]\nname = \"{memory}\"\n{option}\n"));
         let stderr = scene.learner(&["train", "--config", "memory.toml", "--out", "run"]).expect(2).stderr;
