@@ -55,7 +55,10 @@ fn own_backwards_agree_with_autograd() {
             let own = gradients(own, &x, &weight, &parameters);
             let by_steps = gradients(by_steps, &x, &weight, &parameters);
             assert_close(&own.0, &by_steps.0, 1e-5, &what);
-            assert_gradients_close(&own.1, &by_steps.1, 5e-5, &what);
+            // A single unit's gradient may cancel to almost nothing: on the scale of the input's, as above.
+            for (key, gradient) in &own.1 {
+                assert_close(gradient, &by_steps.1[key], 1e-5, &format!("{what}: {key}"));
+            }
         }
     }
 }
@@ -88,7 +91,7 @@ fn f64_agrees() {
         let wide = run(&*memory, Kind::Double, &parameters);
         assert_close(&narrow.0, &wide.0, 1e-5, name);
         assert_close(&narrow.1, &wide.1, 1e-5, name);
-        assert_gradients_close(&narrow.2, &wide.2, 5e-5, name);
+        assert_gradients_close(&narrow.2, &wide.2, 1e-5, name);
     }
 }
 
