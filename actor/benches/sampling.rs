@@ -61,6 +61,7 @@ fn rollout(memory: &str, env: &str, slots: u32) -> anyhow::Result<Rollout> {
         lag: 0,
         rows: slots,
         evaluation: false,
+        greedy: false,
     };
     let mut rollout = Rollout::new(&envs, &memories, spec, slots)?;
     let weights = rollout.policy().to_bytes();

@@ -320,7 +320,14 @@ impl Rollout {
         for (row, params) in self.rows.iter_mut().zip(self.params.chunks_exact(distribution.width())) {
             let Some(slot) = *row else { continue };
             let Slot { actions, episode } = &mut self.slots[slot];
-            let log_prob = distribution.sample(params, actions, self.stored_actions.row_mut(slot));
+            let stored = self.stored_actions.row_mut(slot);
+            let log_prob = if self.spec.greedy {
+                distribution.mode(params, stored);
+                // What this policy is certain to do.
+                0.0
+            } else {
+                distribution.sample(params, actions, stored)
+            };
             distribution.to_env(self.stored_actions.row(slot), self.env_actions.row_mut(slot));
             let step = self.envs.step(slot, self.env_actions.row(slot), &mut self.observations)?;
             episode.push(self.stored_actions.row(slot), log_prob, step.reward, self.observations.row(slot));

@@ -3,8 +3,10 @@
 use std::collections::BTreeMap;
 
 use popgym_actor::{Rollout, invariance};
+use popgym_envs::Value;
 use popgym_models::memory;
-use popgym_proto::{Episode, EpisodeSpec, RunSpec};
+use popgym_proto::{Columns, Episode, EpisodeSpec, RunSpec};
+use tch::Tensor;
 
 fn spec(env: &str, memory: &str) -> RunSpec {
     let memories = memory::Registry::standard();
@@ -20,6 +22,7 @@ fn spec(env: &str, memory: &str) -> RunSpec {
         lag: 0,
         rows: 32,
         evaluation: false,
+        greedy: false,
     }
 }
 
@@ -100,6 +103,36 @@ fn streams_differ_by_epoch_and_purpose() {
     assert!(play(&mut first, &[0], 1) != expected);
     first.open(3, 2, None).unwrap();
     assert!(play(&mut first, &[0], 1) == expected);
+}
+
+#[test]
+fn a_greedy_policy_takes_the_likeliest_actions() {
+    let drawn = RunSpec { evaluation: true, ..spec("RepeatPreviousEasy", "gru") };
+    let mut first = rollout(drawn.clone(), 16, None);
+    let weights = first.policy().to_bytes();
+    let mut greedy = rollout(RunSpec { greedy: true, ..drawn }, 16, Some(&weights));
+    let played = play(&mut greedy, &[0, 1, 2], 3);
+    assert!(played != play(&mut first, &[0, 1, 2], 3));
+    for episode in played.values() {
+        assert!(episode.log_probs.iter().all(|&log_prob| log_prob.to_bits() == 0));
+        let policy = greedy.policy();
+        let mut state = policy.initial_state(1);
+        for t in 0..episode.steps {
+            let class = |columns: &Columns, t: usize| columns.discrete[t];
+            let mut features = vec![0.0; policy.encoder().width()];
+            let seen = [class(&episode.observations, t)];
+            let previous = [if t > 0 { class(&episode.actions, t - 1) } else { 0 }];
+            let value = |discrete| Value { discrete, real: &[] };
+            policy.encoder().encode(value(&seen), value(&previous), t == 0, &mut features);
+            let features = Tensor::from_slice(&features).view([1, -1]);
+            let (params, next) = policy.act(&features, &state);
+            let params = Vec::<f32>::try_from(params.view(-1)).unwrap();
+            let action = class(&episode.actions, t);
+            let most = params.iter().copied().fold(f32::NEG_INFINITY, f32::max);
+            assert!(most - params[action as usize] < 1e-6, "step {t}: {params:?}, took {action}");
+            state = next;
+        }
+    }
 }
 
 #[test]

@@ -22,6 +22,8 @@ pub enum Purpose {
     Shuffle = 5,
     /// The first weights.
     Weights = 6,
+    /// Resampling of results, for the intervals of reports.
+    Resample = 7,
 }
 
 /// The stream of `purpose` in episode `(epoch, index)` of the run seeded with `run_seed`.

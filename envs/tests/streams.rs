@@ -16,6 +16,7 @@ fn streams_differ_in_each_of_their_four_parts() {
         Purpose::EvalAction,
         Purpose::Shuffle,
         Purpose::Weights,
+        Purpose::Resample,
     ];
     let mut seen = HashSet::new();
     for part in 0..3 {

@@ -8,6 +8,7 @@ use clap::{Parser, Subcommand, ValueEnum};
 use serde::Serialize;
 use toml::{Table, Value};
 
+use crate::commands::{CompareArgs, ReportArgs, StudyListArgs, StudyRunArgs};
 use crate::ppo_keys::PpoFlags;
 
 /// Trains agents that must remember: PPO on whole episodes, sampled by actors.
@@ -34,8 +35,24 @@ pub enum Command {
     Watch(WatchArgs),
     /// Write a trained agent as a file that other programs run
     Export(ExportArgs),
+    /// Draw runs over one another, by steps and by wall time
+    Compare(CompareArgs),
+    /// Many runs: environments x memories x seeds
+    #[command(subcommand)]
+    Study(StudyCommand),
     /// Show what can be named
     List(ListArgs),
+}
+
+/// `learner study`.
+#[derive(Debug, Subcommand)]
+pub enum StudyCommand {
+    /// Run the trials of a study that are not done yet; each is a run directory
+    Run(StudyRunArgs),
+    /// Show the trials of a study
+    List(StudyListArgs),
+    /// Tables and figures of any runs, beside the paper's
+    Report(ReportArgs),
 }
 
 /// `learner train`.
@@ -53,6 +70,9 @@ pub struct TrainArgs {
     /// Memory (`learner list memories`) [default: gru]
     #[arg(long, value_name = "NAME")]
     pub memory: Option<String>,
+    /// Stop, as after Ctrl-C, when standard input ends
+    #[arg(long, hide = true)]
+    pub with_parent: bool,
     /// Keys of the run.
     #[command(flatten)]
     pub run: RunFlags,
@@ -207,6 +227,12 @@ pub struct EvalArgs {
     /// Which weights: of the checkpoint with the best mean return, or the last
     #[arg(long, value_enum, default_value_t = Which::Best)]
     pub checkpoint: Which,
+    /// Play another environment: another difficulty of the run's, or any whose spaces are the same
+    #[arg(long, value_name = "ID")]
+    pub env: Option<String>,
+    /// Take the likeliest actions, draw none
+    #[arg(long)]
+    pub greedy: bool,
     /// Local actor processes
     #[arg(long, value_name = "N", default_value_t = 1)]
     pub actors: u32,

@@ -123,13 +123,12 @@ impl Batch {
             let values: Vec<f64> =
                 values[start..=start + rewards.len()].iter().map(|&value| f64::from(value)).collect();
             let (&last, values) = values.split_last().expect("an episode of T steps has T + 1 values");
-            let bootstrap = if self.terminated[episode] || !ppo.bootstrap_at_truncation { 0.0 } else { last };
+            let bootstrap = gae::bootstrap(self.terminated[episode], ppo.bootstrap_at_truncation, last);
             let scaled: Vec<f64> = rewards.iter().map(|reward| reward * ppo.reward_scale).collect();
             advantages.extend(gae::advantages(&scaled, values, bootstrap, ppo.gamma, ppo.gae_lambda));
             old_values.extend_from_slice(values);
         }
-        let targets: Vec<f64> =
-            advantages.iter().zip(&old_values).map(|(advantage, value)| advantage + value).collect();
+        let targets = gae::value_targets(&advantages, &old_values);
         let (_, target_variance) = gae::mean_and_variance(&targets);
         let (_, residual_variance) = gae::mean_and_variance(&advantages);
         let log_prob_difference = self.log_prob_difference(&log_probs);

@@ -70,13 +70,18 @@ struct Manifest {
     files: BTreeMap<String, String>,
 }
 
+/// Where below `dir` the checkpoint of the first `epoch` epochs is.
+pub(crate) fn path(dir: &Path, epoch: u64) -> PathBuf {
+    dir.join(format!("epoch-{epoch:06}"))
+}
+
 impl Checkpoint {
     /// Writes the checkpoint below `dir` and returns its path. `about` is kept in the manifest.
     ///
     /// # Errors
     /// The file or directory that cannot be written. What was there before is untouched.
     pub fn save(&self, dir: &Path, about: &Value) -> anyhow::Result<PathBuf> {
-        let path = dir.join(format!("epoch-{:06}", self.progress.epoch));
+        let path = path(dir, self.progress.epoch);
         let temporary = path.with_extension(TEMPORARY_SUFFIX.trim_start_matches('.'));
         remove_dir_if_there(&temporary)?;
         fs::create_dir_all(&temporary).with_context(|| format!("cannot create {}", temporary.display()))?;

@@ -81,6 +81,18 @@ pub struct ServiceConfig {
     pub metrics_listen: String,
 }
 
+/// What episodes are played for.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Purpose {
+    /// To learn from them.
+    Training,
+    /// To see how good the policy is: on streams of their own, never those of training.
+    Evaluation {
+        /// The likeliest actions are taken, none is drawn.
+        greedy: bool,
+    },
+}
+
 /// More local actors than this are a slip of the pen.
 const MAX_LOCAL_ACTORS: u64 = 256;
 
@@ -185,7 +197,7 @@ impl Config {
     ///
     /// # Errors
     /// None that a valid configuration can cause.
-    pub fn run_spec(&self, run: &str, evaluation: bool) -> anyhow::Result<RunSpec> {
+    pub fn run_spec(&self, run: &str, purpose: Purpose) -> anyhow::Result<RunSpec> {
         Ok(RunSpec {
             run: run.to_owned(),
             env: self.env.clone(),
@@ -197,7 +209,8 @@ impl Config {
             seed: self.seed,
             lag: self.lag,
             rows: self.rows,
-            evaluation,
+            evaluation: purpose != Purpose::Training,
+            greedy: purpose == Purpose::Evaluation { greedy: true },
         })
     }
 
@@ -314,7 +327,7 @@ fn resolve_memory(table: &mut Table, memories: &memory::Registry) -> anyhow::Res
 }
 
 /// Puts the keys of `over` over those of `base`, table by table.
-fn merge(base: &mut Table, over: &Table) {
+pub(crate) fn merge(base: &mut Table, over: &Table) {
     for (key, value) in over {
         match (base.get_mut(key), value) {
             (Some(Value::Table(base)), Value::Table(over)) => merge(base, over),
@@ -367,9 +380,10 @@ fn text<'a>(table: &'a Table, key: &str, path: &str) -> anyhow::Result<Option<&'
 
 /// The most similar of `names`.
 pub fn nearest<'a>(name: &str, names: impl Iterator<Item = &'a str>) -> Option<&'a str> {
-    names.max_by(|a, b| strsim::jaro_winkler(a, name).total_cmp(&strsim::jaro_winkler(b, name)))
+    let likeness = |known: &str| strsim::jaro_winkler(known, &name.to_lowercase());
+    names.max_by(|a, b| likeness(a).total_cmp(&likeness(b)))
 }
 
-fn one_line(error: &toml::de::Error) -> String {
+pub(crate) fn one_line(error: &toml::de::Error) -> String {
     error.to_string().split_whitespace().collect::<Vec<_>>().join(" ")
 }

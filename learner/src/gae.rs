@@ -1,5 +1,12 @@
 //! Generalised advantage estimation (Schulman et al., 2016, equation 16), on the CPU in f64.
 
+/// The value of what follows an episode's last step: 0 where the episode has terminated, also if its time was up at that very
+/// step; `last`, that of its last observation, where it was merely truncated and the run bootstraps there
+/// (`at_truncation`).
+pub fn bootstrap(terminated: bool, at_truncation: bool, last: f64) -> f64 {
+    if terminated || !at_truncation { 0.0 } else { last }
+}
+
 /// Advantages of one episode.
 ///
 /// `rewards` `r_0 .. r_{T-1}`; `values` `V(o_0) .. V(o_{T-1})`; `bootstrap` is the value of what follows the last step: 0
@@ -22,6 +29,12 @@ pub fn advantages(rewards: &[f64], values: &[f64], bootstrap: f64, gamma: f64, l
     advantages
 }
 
+/// What the critic learns: `R_t = A_t + V_t`, of the advantages before they are standardised (reference 3.3). With lambda 1
+/// it is the discounted return.
+pub fn value_targets(advantages: &[f64], values: &[f64]) -> Vec<f64> {
+    advantages.iter().zip(values).map(|(advantage, value)| advantage + value).collect()
+}
+
 /// `(x - mean) / max(1e-4, population standard deviation)`, over the whole batch (RLlib's standardisation).
 pub fn standardise(values: &mut [f64]) {
     let (mean, variance) = mean_and_variance(values);
@@ -42,7 +55,30 @@ pub fn mean_and_variance(values: &[f64]) -> (f64, f64) {
 mod tests {
     use proptest::prelude::*;
 
-    use super::{advantages, standardise};
+    use super::{advantages, bootstrap, standardise, value_targets};
+
+    /// Terminated, truncated, both, a single step; in halves and quarters, which are exact.
+    #[allow(clippy::float_cmp)]
+    #[test]
+    fn every_kind_of_end() {
+        // gamma 0.5, lambda 1: targets are discounted returns.
+        let targets = |rewards: &[f64], values: &[f64], end: f64| {
+            value_targets(&advantages(rewards, values, end, 0.5, 1.0), values)
+        };
+        for (terminated, at_truncation, expected) in
+            [(true, true, 0.0), (true, false, 0.0), (false, true, 8.0), (false, false, 0.0)]
+        {
+            // An episode that is both terminated and truncated counts as terminated.
+            let end = bootstrap(terminated, at_truncation, 8.0);
+            assert_eq!(end, expected);
+            assert_eq!(targets(&[1.0], &[0.25], end), [1.0 + 0.5 * end]);
+            assert_eq!(
+                targets(&[1.0, 0.0, -2.0], &[0.5, 4.0, -1.0], end),
+                [0.5 + 0.125 * end, -1.0 + 0.25 * end, -2.0 + 0.5 * end]
+            );
+        }
+        assert_eq!(advantages(&[1.0], &[0.25], 8.0, 0.5, 0.0), [4.75], "one step, whatever lambda");
+    }
 
     // The numbers are halves and quarters: exact.
     #[allow(clippy::float_cmp)]

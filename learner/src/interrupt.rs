@@ -44,6 +44,21 @@ impl Interrupt {
         Ok(interrupt)
     }
 
+    /// Asks to stop, too, when standard input ends: whoever has started this program and holds the other end is gone.
+    ///
+    /// # Errors
+    /// There is no thread to wait for that.
+    pub fn with_parent(&self) -> anyhow::Result<()> {
+        let requested = self.requested.clone();
+        let wait = move || {
+            // Nothing is expected; an error is an end, too.
+            let _ = std::io::copy(&mut std::io::stdin().lock(), &mut std::io::sink());
+            requested.store(true, Ordering::SeqCst);
+        };
+        std::thread::Builder::new().name("parent".to_owned()).spawn(wait).context("no thread for the parent")?;
+        Ok(())
+    }
+
     /// Whether a signal has come.
     pub fn requested(&self) -> bool {
         self.requested.load(Ordering::SeqCst)

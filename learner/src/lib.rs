@@ -2,13 +2,17 @@
 //!
 //! | module | holds |
 //! |---|---|
-//! | [`commands`] | `train`, `resume`, `eval`, `play`, `watch`, `list` |
+//! | [`commands`] | `train`, `resume`, `eval`, `play`, `watch`, `compare`, `study`, `list` |
 //! | [`config`], [`ppo_keys`] | the configuration: presets, file and flags merged |
 //! | [`trainer`] | the epochs of a run, one after the other |
-//! | [`update`] | PPO, top to bottom; [`gae`], [`adam`] and [`batch`] are what it uses |
+//! | [`update`] | PPO, top to bottom; [`batch`], [`gae`], [`minibatches`], [`loss`] and [`adam`] are what it uses |
 //! | [`service`] | sessions with actors, leases, episodes |
 //! | [`local_actors`] | actor processes on this machine |
 //! | [`checkpoint`], [`run_dir`] | what a run leaves on disk to continue from |
+//! | [`study`] | many runs: environments x memories x seeds |
+//! | [`report`] | tables, figures and a page of many runs, beside the paper's |
+//! | `chart` | what all charts share |
+//! | [`statistics`] | means, quantiles, intervals, rank correlation |
 //! | `screen` | environments on a terminal and as animated images: what `play` and `watch` show |
 //! | [`baseline`], [`space_text`] | what acting at random scores; spaces in words |
 //! | [`observer`] | what a run tells: files, progress bar, TensorBoard, Prometheus |
@@ -19,6 +23,7 @@ pub mod adam;
 pub mod args;
 pub mod baseline;
 pub mod batch;
+mod chart;
 pub mod checkpoint;
 pub mod commands;
 pub mod config;
@@ -26,14 +31,19 @@ mod files;
 pub mod gae;
 pub mod interrupt;
 pub mod local_actors;
+pub mod loss;
 pub mod manifest;
+pub mod minibatches;
 pub mod observer;
 pub mod ppo_keys;
+pub mod report;
 pub mod run_dir;
 mod screen;
 pub mod service;
 pub mod session;
 pub mod space_text;
+pub mod statistics;
+pub mod study;
 pub mod trainer;
 pub mod update;
 pub mod waiting;
@@ -44,7 +54,7 @@ use std::process::ExitCode;
 
 use clap::Parser;
 
-use crate::args::{Args, Command};
+use crate::args::{Args, Command, StudyCommand};
 use crate::commands::Failure;
 use crate::observer::{Observer, Progress};
 
@@ -99,6 +109,10 @@ pub fn run(extensions: Extensions, arguments: impl IntoIterator<Item = OsString>
         Command::Export(args) => commands::export(&args, &extensions),
         Command::Play(args) => commands::play(&args, &extensions),
         Command::Watch(args) => commands::watch(&args, &extensions),
+        Command::Study(StudyCommand::Run(args)) => commands::study_run(&args, &extensions),
+        Command::Study(StudyCommand::List(args)) => commands::study_list(&args, &extensions),
+        Command::Compare(args) => commands::compare(&args),
+        Command::Study(StudyCommand::Report(args)) => commands::report(&args, &extensions),
         Command::List(args) => commands::list(&args, &extensions),
     };
     match result {

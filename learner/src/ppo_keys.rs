@@ -4,6 +4,8 @@
 use popgym_envs::EnvSpec;
 use serde::{Deserialize, Serialize};
 
+use crate::minibatches::Minibatches;
+
 macro_rules! ppo_keys {
     ($( $(#[doc = $doc:literal])+ $name:ident: $type:ty = $paper:expr, $quick:expr; )+) => {
         /// Hyper-parameters of PPO: the configuration's `[ppo]` table.
@@ -43,6 +45,9 @@ ppo_keys! {
     batch_steps: i64 = 65_536, |quick: &Quick| quick.batch_steps;
     /// Steps of a minibatch, about: whole episodes, shuffled
     minibatch_steps: i64 = 8_192, |quick: &Quick| quick.batch_steps / 8;
+    /// fixed: episodes share a minibatch with the same ones in every pass, and what is left of the last is not used (as in
+    /// the paper); shuffled: every pass cuts all episodes anew
+    minibatches: Minibatches = Minibatches::Fixed, |_: &Quick| Minibatches::Shuffled;
     /// Passes over an epoch's batch
     passes: u32 = 30, |_: &Quick| 3;
     /// Discount of a step

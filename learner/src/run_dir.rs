@@ -103,6 +103,11 @@ fn fresh_run_id(path: &Path) -> String {
     format!("{:x}", Sha256::digest(text))[..16].to_owned()
 }
 
+/// Whether a learner is working in the run directory `path`.
+pub(crate) fn is_locked(path: &Path) -> bool {
+    File::open(path.join("lock")).is_ok_and(|file| matches!(file.try_lock(), Err(TryLockError::WouldBlock)))
+}
+
 fn lock(path: &Path) -> anyhow::Result<File> {
     let file = path.join("lock");
     let lock = File::create(&file).with_context(|| format!("cannot write {}", file.display()))?;

@@ -11,7 +11,7 @@ use rand::Rng as _;
 use tch::Device;
 
 use crate::Extensions;
-use crate::config::Config;
+use crate::config::{self, Config};
 use crate::local_actors::{ActorCommand, Hopeless, LocalActors};
 use crate::service::Service;
 
@@ -119,13 +119,13 @@ impl<'a> Session<'a> {
     ///
     /// # Errors
     /// As [`Session::listen`], if that was not called before; or the actors cannot be started.
-    pub fn serve(&mut self, run: &str, evaluation: bool) -> anyhow::Result<()> {
+    pub fn serve(&mut self, run: &str, purpose: config::Purpose) -> anyhow::Result<()> {
         if self.listener.is_none() {
             self.listen()?;
         }
         let listener = self.listener.take().context("no listening address")?;
         let address = listener.local_addr()?;
-        let spec = self.config.run_spec(run, evaluation)?;
+        let spec = self.config.run_spec(run, purpose)?;
         let episodes = EpisodeSpec {
             observation: self.env.observation.clone(),
             action: self.stored_action.clone(),

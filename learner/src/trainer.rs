@@ -198,7 +198,7 @@ impl Trainer<'_> {
         let sampling = if pipelined { newest } else { weights.clone() };
         let ppo = &self.config.ppo;
         state.progress.epoch += 1;
-        state.progress.kl_coef = update::next_kl_coef(state.progress.kl_coef, means.kl, ppo.kl_target);
+        state.progress.kl_coef = update::next_kl_coef(state.progress.kl_coef, means.minibatch_kl, ppo.kl_target);
         state.progress.wall_seconds = state.earlier_seconds + state.started.elapsed().as_secs_f64();
         let optimizer = copy_moments(state.adam.state());
         if !pipelined {
@@ -318,15 +318,16 @@ fn epoch_metrics(
     explained_variance: f64,
 ) -> EpochMetrics {
     let progress = &state.progress;
-    let returns = episodes.iter().map(Episode::total_return);
+    let returns: Vec<f64> = episodes.iter().map(Episode::total_return).collect();
     let lengths: Vec<f64> = episodes.iter().map(|episode| episode.steps as f64).collect();
     EpochMetrics {
         epoch,
         env_steps: progress.env_steps,
         episodes: progress.episodes,
         mean_return: progress.mean_return.unwrap_or_default(),
-        min_return: returns.clone().fold(f64::INFINITY, f64::min),
-        max_return: returns.fold(f64::NEG_INFINITY, f64::max),
+        epoch_return: mean(&returns),
+        min_return: returns.iter().copied().fold(f64::INFINITY, f64::min),
+        max_return: returns.iter().copied().fold(f64::NEG_INFINITY, f64::max),
         mean_length: mean(&lengths),
         mmer: progress.mmer.unwrap_or_default(),
         policy_loss: means.policy_loss,

@@ -16,6 +16,8 @@ use tch::{Device, Kind, Tensor};
 use crate::adam::Adam;
 use crate::batch::{Batch, OldPolicy};
 use crate::config::Ppo;
+use crate::loss::{clamped_squared_error, surrogate};
+use crate::minibatches::minibatches;
 
 /// Means over all minibatches of all passes, weighted by steps.
 #[derive(Clone, Copy, Debug, Default)]
@@ -26,6 +28,8 @@ pub struct UpdateMeans {
     pub value_loss: f64,
     /// KL(old || new), nats a step.
     pub kl: f64,
+    /// The same, but each minibatch counts as much as any other: what the adaptive coefficient follows.
+    pub minibatch_kl: f64,
     /// Entropy, nats a step.
     pub entropy: f64,
     /// Norm of the gradient before it was scaled down.
@@ -69,7 +73,7 @@ pub fn update(
 ) -> Result<UpdateMeans, UpdateError> {
     let mut totals = Totals::new(policy.device());
     for pass in 1..=ppo.passes {
-        for (episodes, number) in minibatches(&batch.lengths, ppo.minibatch_steps, rng).into_iter().zip(1..) {
+        for (episodes, number) in minibatches(&batch.lengths, ppo, rng).into_iter().zip(1..) {
             if interrupted() {
                 return Err(UpdateError::Interrupted);
             }
@@ -94,6 +98,7 @@ pub fn update(
                 pass,
                 minibatch: number,
             })?;
+            policy.constrain();
             let means = [&losses.policy, &losses.value, &losses.kl, &losses.entropy, &grad_norm];
             totals.add(&means, minibatch.packing.rows(), computed_steps);
         }
@@ -110,8 +115,7 @@ pub struct Schedule {
     pub kl_coef: f64,
 }
 
-/// The KL coefficient of the next epoch, given the mean KL of this one's update (a mean over steps, where RLlib takes one
-/// over its minibatches): half again as large above twice the
+/// The KL coefficient of the next epoch, given the mean KL of this one's minibatches: half again as large above twice the
 /// target, half below half of it (Schulman et al., 2017, section 4, with RLlib's factors).
 pub fn next_kl_coef(kl_coef: f64, kl: f64, kl_target: f64) -> f64 {
     if kl > 2.0 * kl_target {
@@ -121,28 +125,6 @@ pub fn next_kl_coef(kl_coef: f64, kl: f64, kl_target: f64) -> f64 {
     } else {
         kl_coef
     }
-}
-
-/// Whole episodes, shuffled, cut into parts of about `budget` steps; every episode is in exactly one.
-///
-/// There are round(steps / budget) parts (1 at least), as equal as whole episodes allow: an episode belongs to the part
-/// in which its middle falls when all are laid end to end.
-pub fn minibatches(lengths: &[i64], budget: i64, rng: &mut EpisodeRng) -> Vec<Vec<usize>> {
-    let mut order: Vec<usize> = (0..lengths.len()).collect();
-    for last in (1..order.len()).rev() {
-        order.swap(last, popgym_envs::rng::below(rng, last as u32 + 1) as usize);
-    }
-    let total: i64 = lengths.iter().sum();
-    let parts = ((total + budget / 2) / budget).clamp(1, lengths.len() as i64);
-    let mut minibatches = vec![Vec::new(); parts as usize];
-    let mut before = 0;
-    for episode in order {
-        let middle = before + lengths[episode] / 2;
-        minibatches[(middle * parts / total) as usize].push(episode);
-        before += lengths[episode];
-    }
-    minibatches.retain(|episodes| !episodes.is_empty());
-    minibatches
 }
 
 /// One minibatch, packed.
@@ -174,13 +156,10 @@ impl Minibatch {
     }
 
     fn losses(&self, scores: &Evaluation, values: &Tensor, ppo: &Ppo) -> Losses {
-        let ratio = (&scores.log_prob - &self.old_log_probs).exp();
-        let clipped = ratio.clamp(1.0 - ppo.clip, 1.0 + ppo.clip) * &self.advantages;
-        let surrogate = (ratio * &self.advantages).minimum(&clipped);
-        let squared_error = (values - &self.targets).square();
+        let surrogate = surrogate(&scores.log_prob, &self.old_log_probs, &self.advantages, ppo.clip);
         Losses {
             policy: -surrogate.mean(Kind::Float),
-            value: squared_error.clamp_max(ppo.value_clip).mean(Kind::Float),
+            value: clamped_squared_error(values, &self.targets, ppo.value_clip).mean(Kind::Float),
             entropy: scores.entropy.mean(Kind::Float),
             kl: scores.kl.mean(Kind::Float),
         }
@@ -198,28 +177,38 @@ struct Losses {
 /// Sums of the reported quantities, kept on the device so that no minibatch waits for it.
 struct Totals {
     sums: Tensor,
+    /// Of the minibatches' KL, each once.
+    kl: Tensor,
+    minibatches: i64,
     steps: i64,
     computed_steps: i64,
 }
 
 impl Totals {
     fn new(device: Device) -> Self {
-        Self { sums: Tensor::zeros([5], (Kind::Double, device)), steps: 0, computed_steps: 0 }
+        let zeros = |count: i64| Tensor::zeros([count], (Kind::Double, device));
+        Self { sums: zeros(5), kl: zeros(1), minibatches: 0, steps: 0, computed_steps: 0 }
     }
 
     fn add(&mut self, means: &[&Tensor; 5], steps: i64, computed_steps: i64) {
-        tch::no_grad(|| self.sums += Tensor::stack(means, 0).to_kind(Kind::Double) * steps as f64);
+        tch::no_grad(|| {
+            let means = Tensor::stack(means, 0).to_kind(Kind::Double);
+            self.kl += means.narrow(0, 2, 1);
+            self.sums += means * steps as f64;
+        });
+        self.minibatches += 1;
         self.steps += steps;
         self.computed_steps += computed_steps;
     }
 
     fn means(self) -> UpdateMeans {
-        let means = Vec::<f64>::try_from((self.sums / self.steps as f64).to_device(Device::Cpu))
-            .expect("five f64 numbers on the CPU are a vector");
+        let means = Tensor::cat(&[self.sums / self.steps as f64, self.kl / self.minibatches as f64], 0);
+        let means = Vec::<f64>::try_from(means.to_device(Device::Cpu)).expect("f64 numbers on the CPU are a vector");
         UpdateMeans {
             policy_loss: means[0],
             value_loss: means[1],
             kl: means[2],
+            minibatch_kl: means[5],
             entropy: means[3],
             grad_norm: means[4],
             valid_fraction: self.steps as f64 / self.computed_steps as f64,
@@ -229,13 +218,11 @@ impl Totals {
 
 #[cfg(test)]
 mod tests {
-    use popgym_envs::{Purpose, stream};
     use popgym_models::Packing;
     use popgym_models::distribution::Evaluation;
-    use proptest::prelude::*;
     use tch::Tensor;
 
-    use super::{Minibatch, minibatches, next_kl_coef};
+    use super::{Minibatch, next_kl_coef};
     use crate::config::Ppo;
 
     /// Reference 3.5, by hand: clip 0.3, squared error clamped at 10. The three steps are: ratio 2 clipped to 1.3 with a
@@ -273,24 +260,5 @@ mod tests {
         assert!(near(next_kl_coef(0.2, 0.020, 0.01), 0.2));
         assert!(near(next_kl_coef(0.2, 0.005, 0.01), 0.2));
         assert!(near(next_kl_coef(0.2, 0.0049, 0.01), 0.1));
-    }
-
-    proptest! {
-        #[test]
-        fn every_episode_is_in_one_minibatch(
-            lengths in proptest::collection::vec(1..300i64, 1..80), budget in 1..5000i64, seed in 0..1000u64,
-        ) {
-            let mut rng = stream(seed, 0, 0, Purpose::Shuffle);
-            let parts = minibatches(&lengths, budget, &mut rng);
-            let mut seen: Vec<usize> = parts.concat();
-            seen.sort_unstable();
-            prop_assert_eq!(seen, (0..lengths.len()).collect::<Vec<_>>());
-            // A part is the budget, give or take what rounding to whole parts and whole episodes makes of it.
-            let longest = lengths.iter().max().unwrap();
-            for part in &parts {
-                let steps: i64 = part.iter().map(|&episode| lengths[episode]).sum();
-                prop_assert!(steps <= budget + budget / 2 + 2 * longest + 1);
-            }
-        }
     }
 }

@@ -182,7 +182,7 @@ fn index_tensor(values: &[usize], device: Device) -> Tensor {
 }
 
 /// Of each simple space: zeros where it contains them, else its lower bounds (upstream's `PreviousAction`; where such a
-/// bound is infinite, the upper one).
+/// bound is infinite, the upper one, or 0 if that is smaller).
 fn null_action(action: &Space) -> Slab {
     fn append(space: &Space, real: &mut Vec<f32>) {
         match space {

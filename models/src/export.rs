@@ -14,7 +14,7 @@
 use std::fmt::Write as _;
 use std::io::{Cursor, Read as _, Write as _};
 
-use tch::{CModule, Device, Kind, Tensor};
+use tch::{CModule, Device, IValue, Kind, Tensor};
 use zip::write::SimpleFileOptions;
 use zip::{CompressionMethod, ZipArchive, ZipWriter};
 
@@ -34,6 +34,12 @@ pub enum ExportError {
     /// libtorch refuses.
     #[error("TorchScript: {0}")]
     TorchScript(#[from] tch::TchError),
+    /// What was traced is not the step: numbers of the example have become constants.
+    #[error(
+        "the TorchScript of memory `{0}` gives other results than its step; a step must be made of tensor operators alone, \
+         with neither numbers nor the count of rows read into Rust"
+    )]
+    Untraceable(String),
     /// The module cannot be written or read again.
     #[error("TorchScript module: {0}")]
     Archive(#[from] std::io::Error),
@@ -49,7 +55,8 @@ impl From<zip::result::ZipError> for ExportError {
 /// of a TorchScript file.
 ///
 /// # Errors
-/// What is wrong with the specification or the weights; a memory whose step is not made of libtorch's operators.
+/// What is wrong with the specification or the weights; a memory whose step is not made of libtorch's operators alone, so that
+/// the file does not do what the step does.
 pub fn torchscript(spec: &PolicySpec, memories: &Registry, weights: &[u8]) -> Result<Vec<u8>, ExportError> {
     let mut policy = Policy::new(spec, memories, Device::Cpu)?;
     policy.load(weights)?;
@@ -65,12 +72,13 @@ pub fn torchscript(spec: &PolicySpec, memories: &Registry, weights: &[u8]) -> Re
         let columns: Vec<Tensor> = outputs.iter().zip(&widths).map(|(x, width)| x.view([-1, width.columns])).collect();
         vec![Tensor::cat(&columns, 1)]
     };
-    let inputs = example(&policy, &encoder);
+    let inputs = example(&policy, &encoder, ROWS, 0.0);
     let module = tch::no_grad(|| CModule::create_by_tracing("Policy", FLAT, &inputs, &mut flat))?;
     let dir = tempfile::tempdir()?;
     let path = dir.path().join("policy.pt");
     module.save(&path)?;
-    with_forward(&std::fs::read(path)?, &forward_method(&widths))
+    let bytes = with_forward(&std::fs::read(path)?, &forward_method(&widths))?;
+    check(&bytes, &policy, &encoder).then_some(bytes).ok_or_else(|| ExportError::Untraceable(spec.memory.clone()))
 }
 
 /// Rows of the example that is traced. Not 1, which a broadcast could hide.
@@ -79,12 +87,33 @@ const ROWS: i64 = 2;
 /// The traced method: all outputs as columns of one tensor.
 const FLAT: &str = "flat";
 
-fn example(policy: &Policy, encoder: &NumberEncoder) -> Vec<Tensor> {
-    let zeros = |shape: &[i64]| Tensor::zeros(shape, (Kind::Float, Device::Cpu));
+/// Inputs that are all `number`, with the state before the first step.
+fn example(policy: &Policy, encoder: &NumberEncoder, rows: i64, number: f64) -> Vec<Tensor> {
+    let filled = |shape: &[i64]| Tensor::full(shape, number, (Kind::Float, Device::Cpu));
     let (observation, action) = encoder.components();
-    let mut inputs = vec![zeros(&[ROWS, observation as i64]), zeros(&[ROWS, action as i64]), zeros(&[ROWS])];
-    inputs.extend(policy.initial_state(ROWS).0);
+    let mut inputs = vec![filled(&[rows, observation as i64]), filled(&[rows, action as i64]), filled(&[rows])];
+    inputs.extend(policy.initial_state(rows).0);
     inputs
+}
+
+/// Whether the file does what [`step`] does, over a few steps with other numbers and more rows than were traced.
+fn check(file: &[u8], policy: &Policy, encoder: &NumberEncoder) -> bool {
+    let Ok(module) = CModule::load_data(&mut Cursor::new(file)) else { return false };
+    let mut ours = example(policy, encoder, ROWS + 1, 1.0);
+    let mut theirs: Vec<Tensor> = ours.iter().map(Tensor::copy).collect();
+    (0..3).all(|_| {
+        let inputs: Vec<IValue> = theirs.iter().map(|tensor| IValue::Tensor(tensor.shallow_clone())).collect();
+        let Ok(IValue::Tuple(outputs)) = module.forward_is(&inputs) else { return false };
+        let found: Vec<Tensor> = outputs.into_iter().filter_map(|output| output.try_into().ok()).collect();
+        let expected = tch::no_grad(|| step(policy, encoder, &ours));
+        let close = |(a, b): (&Tensor, &Tensor)| a.size() == b.size() && a.allclose(b, 1e-4, 1e-4, true);
+        let fit = found.len() == expected.len() && found[..2].iter().zip(&expected).all(close);
+        for (inputs, outputs) in [(&mut ours, expected), (&mut theirs, found)] {
+            inputs[2] = inputs[2].zeros_like();
+            inputs.splice(3.., outputs.into_iter().skip(2));
+        }
+        fit
+    })
 }
 
 /// One time step from and to the tensors of the file's description.

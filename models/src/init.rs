@@ -42,7 +42,7 @@ pub(crate) fn uniform(fan_in: i64) -> Init {
 /// Normal with mean 0 and standard deviation 0.01, for the last layer of a head: a nearly uniform first policy.
 pub(crate) const SMALL_NORMAL: Init = Init::Randn { mean: 0.0, stdev: 0.01 };
 
-/// Leaky ReLU with slope 0.01.
-pub(crate) fn leaky_relu(x: &Tensor) -> Tensor {
-    x.leaky_relu()
+/// Leaky ReLU with slope 0.01, in place: at these sizes a fresh tensor costs about as much as the function.
+pub(crate) fn leaky_relu(mut x: Tensor) -> Tensor {
+    x.leaky_relu_()
 }

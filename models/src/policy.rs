@@ -160,6 +160,11 @@ impl Policy {
         &self.parameters
     }
 
+    /// Puts parameters back where they are allowed to be: to be called after every optimiser's step.
+    pub fn constrain(&self) {
+        self.memory.constrain();
+    }
+
     /// Names and shapes of all parameters, one a line: equal for two policies that can exchange weights.
     pub fn signature(&self) -> String {
         self.parameters.iter().fold(String::new(), |mut text, (name, tensor)| {
@@ -273,9 +278,12 @@ impl Policy {
         if let (Some(positional), Some(times)) = (&self.positional, times) {
             u = positional.mix(&u, times);
         }
-        leaky_relu(&self.preprocessor.forward(&u))
+        leaky_relu(self.preprocessor.forward(&u))
     }
 }
+
+/// Bounds of log standard deviations beyond this leave f32: squares of their exponentials are divided.
+const MAX_LOG_STD: f64 = 20.0;
 
 impl PolicySpec {
     fn validate(&self) -> Result<(), ModelError> {
@@ -283,7 +291,14 @@ impl PolicySpec {
             space.validate().map_err(|problem| ModelError::Space { which, problem })?;
         }
         let PolicyOptions { log_std_min, log_std_max } = self.options;
-        // Also false for NaN.
+        for (key, bound, none) in [("log_std_min", log_std_min, "-inf"), ("log_std_max", log_std_max, "inf")] {
+            // Also false for NaN.
+            if !(bound.abs() <= MAX_LOG_STD || bound.to_string() == none) {
+                let problem =
+                    format!("{key} is {bound}, allowed is -{MAX_LOG_STD} to {MAX_LOG_STD}, or {none} for no bound");
+                return Err(ModelError::Options(problem));
+            }
+        }
         if log_std_min <= log_std_max {
             Ok(())
         } else {
@@ -313,6 +328,6 @@ impl Head {
 
     fn forward(&self, x: &Tensor) -> Tensor {
         let [first, second, output] = &self.layers;
-        output.forward(&leaky_relu(&second.forward(&leaky_relu(&first.forward(x)))))
+        output.forward(&leaky_relu(second.forward(&leaky_relu(first.forward(x)))))
     }
 }

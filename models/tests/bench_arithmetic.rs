@@ -3,7 +3,7 @@
 #[path = "../benches/memories/arithmetic.rs"]
 mod arithmetic;
 
-use arithmetic::{Sample, mean, median, pass_operations};
+use arithmetic::{Sample, mean, median, pass_operations, quartiles};
 
 /// Tables of Student's distribution: the two-sided 95% quantile by degrees of freedom.
 const STUDENT: [(usize, f64); 9] =
@@ -27,6 +27,10 @@ fn intervals_are_students() {
 fn medians_and_means() {
     assert!((median(&[3.0, 1.0, 20.0]) - 3.0).abs() < 1e-12);
     assert!((median(&[3.0, 1.0, 20.0, 5.0]) - 4.0).abs() < 1e-12);
+    let [low, high] = quartiles(&[20.0, 1.0, 3.0, 5.0, 9.0]);
+    assert!((low - 3.0).abs() < 1e-12 && (high - 9.0).abs() < 1e-12);
+    let [low, high] = quartiles(&[1.0, 3.0]);
+    assert!((low - 1.5).abs() < 1e-12 && (high - 2.5).abs() < 1e-12);
     assert!((mean(&[3.0, 1.0, 20.0]) - 8.0).abs() < 1e-12);
 }
 

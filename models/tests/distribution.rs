@@ -205,7 +205,10 @@ fn log_standard_deviations_are_kept_within_bounds() {
         options: PolicyOptions { log_std_min: min, log_std_max: max },
         max_steps: 10,
     };
-    for (min, max) in [(1.0, 0.0), (f64::NAN, 0.0), (0.0, f64::NAN)] {
+    let (none, inf) = (f64::NEG_INFINITY, f64::INFINITY);
+    for (min, max) in
+        [(1.0, 0.0), (f64::NAN, 0.0), (0.0, f64::NAN), (inf, inf), (none, none), (none, -200.0), (800.0, inf)]
+    {
         assert!(Policy::new(&spec(min, max), &memory::Registry::standard(), Device::Cpu).is_err());
     }
 }

@@ -9,10 +9,12 @@ use std::process::{Command, Stdio};
 use common::*;
 use popgym_envs::Space;
 use popgym_envs::space::Slab;
-use popgym_models::memory::Registry;
-use popgym_models::{Policy, State, export};
+use popgym_models::export::ExportError;
+use popgym_models::memory::{Memory, MemoryKind, Registry};
+use popgym_models::{Policy, State, export, policy};
 use serde_json::{Value, json};
-use tch::{CModule, Device, IValue, Tensor};
+use tch::nn::Path;
+use tch::{CModule, Device, IValue, Kind, Tensor};
 
 const STEPS: usize = 4;
 
@@ -184,4 +186,44 @@ fn weights_of_another_policy_are_refused() {
     let policy = Policy::new(&spec("mlp"), &Registry::standard(), Device::Cpu).unwrap();
     let error = export::torchscript(&spec("gru"), &Registry::standard(), &policy.to_bytes()).unwrap_err();
     assert!(error.to_string().contains("memory.weight_input"), "{error}");
+}
+
+/// Reads numbers into Rust, which a trace takes for constants.
+#[derive(Debug)]
+struct Reader;
+
+impl MemoryKind for Reader {
+    const NAME: &'static str = "reader";
+    const PAPER_NAME: &'static str = "Reader";
+    const PAPER: &'static str = "none";
+    type Options = toml::Table;
+
+    fn new(_: &Path<'_>, _: i64, _: &toml::Table) -> Result<Self, String> {
+        Ok(Self)
+    }
+}
+
+impl Memory for Reader {
+    fn output_width(&self) -> i64 {
+        policy::WIDTH
+    }
+
+    fn initial_state(&self, rows: i64, device: Device) -> State {
+        State(vec![Tensor::zeros([rows, 1], (Kind::Float, device))])
+    }
+
+    fn step(&self, input: &Tensor, state: &State) -> (Tensor, State) {
+        let seen = input.mean(Kind::Float).double_value(&[]);
+        (input + seen, State(vec![&state.0[0] + 1.0]))
+    }
+}
+
+#[test]
+fn a_step_that_cannot_be_traced_is_not_exported() {
+    let mut memories = Registry::standard();
+    memories.register::<Reader>();
+    let spec = spec("reader", observation_space(), action_space());
+    let policy = Policy::new(&spec, &memories, Device::Cpu).unwrap();
+    let error = export::torchscript(&spec, &memories, &policy.to_bytes()).unwrap_err();
+    assert!(matches!(&error, ExportError::Untraceable(name) if name == "reader"), "{error}");
 }

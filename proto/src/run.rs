@@ -37,6 +37,8 @@ pub struct RunSpec {
     pub rows: u32,
     /// Whether episodes use the streams of evaluation instead of those of training.
     pub evaluation: bool,
+    /// Whether the likeliest actions are taken instead of drawn ones.
+    pub greedy: bool,
 }
 
 impl RunSpec {
@@ -65,6 +67,7 @@ impl RunSpec {
             lag: within("lag", wire.lag, 0..=1)?,
             rows: within("rows", wire.rows, limits::MIN_ROWS..=limits::MAX_SLOTS)?,
             evaluation: wire.evaluation,
+            greedy: wire.greedy,
         })
     }
 
@@ -82,6 +85,7 @@ impl RunSpec {
             lag: self.lag,
             rows: self.rows,
             evaluation: self.evaluation,
+            greedy: self.greedy,
         }
     }
 }
@@ -172,6 +176,7 @@ pub fn fingerprint(spec: &RunSpec, env_text: &str, policy_signature: &str) -> Fi
     field("lag", &spec.lag.to_string());
     field("rows", &spec.rows.to_string());
     field("evaluation", &spec.evaluation.to_string());
+    field("greedy", &spec.greedy.to_string());
     field("env_spec", env_text);
     field("policy", policy_signature);
     Sha256::digest(text.as_bytes()).into()

@@ -204,6 +204,7 @@ fn run_spec() -> RunSpec {
         lag: 1,
         rows: 128,
         evaluation: false,
+        greedy: false,
     }
 }
 
@@ -233,7 +234,7 @@ fn a_run_survives_the_wire() {
 fn the_fingerprint_tells_every_field() {
     let base = fingerprint(&run_spec(), "env", "policy");
     assert_eq!(base, fingerprint(&run_spec(), "env", "policy"));
-    let changes: [&dyn Fn(&mut RunSpec); 10] = [
+    let changes: [&dyn Fn(&mut RunSpec); 11] = [
         &|r| r.run.push('x'),
         &|r| r.env.push('x'),
         &|r| r.observability = popgym_envs::Observability::Full,
@@ -244,6 +245,7 @@ fn the_fingerprint_tells_every_field() {
         &|r| r.seed = 0,
         &|r| r.lag = 0,
         &|r| r.evaluation = true,
+        &|r| r.greedy = true,
     ];
     for (i, change) in changes.iter().enumerate() {
         let mut spec = run_spec();

@@ -133,6 +133,21 @@ impl Scene {
         self.read(&format!("{run}/metrics.csv"))
     }
 
+    /// The largest difference in a run between the log-probabilities of its actors and those of its learner, of the same
+    /// version of the weights.
+    ///
+    /// # Panics
+    /// If the run has no such column.
+    #[track_caller]
+    pub fn log_prob_difference(&self, run: &str) -> f64 {
+        let timing = self.read(&format!("{run}/timing.csv"));
+        let mut lines = timing.lines().map(|line| line.split(',').collect::<Vec<_>>());
+        let head = lines.next().expect("a head");
+        let column = head.iter().position(|name| *name == "log_prob_difference").expect("the column");
+        let differences = lines.map(|line| line[column].parse().expect("a number"));
+        differences.fold(0.0, f64::max)
+    }
+
     /// Rows of a run's `metrics.csv` so far.
     pub fn rows(&self, run: &str) -> usize {
         let text = fs::read_to_string(self.path(run).join("metrics.csv")).unwrap_or_default();

@@ -100,6 +100,7 @@ fn values_out_of_range_in_the_file() {
     assert_bad_file("[ppo]\nlearning_rate = inf", &["ppo.learning_rate is inf"]);
     assert_bad_file("[memory]\nhidden_size = 0", &["hidden_size"]);
     assert_bad_file("[policy]\nlog_std_min = 3.0\nlog_std_max = 1.0", &["log_std_min"]);
+    assert_bad_file("[policy]\nlog_std_min = 800.0\nlog_std_max = inf", &["log_std_min is 800", "-20 to 20"]);
     assert_bad_file("[service]\nlisten = \"nowhere\"", &["listen", "nowhere"]);
     assert_bad_file("[service]\nmetrics_listen = \"nowhere\"", &["metrics_listen", "nowhere"]);
 }
@@ -241,6 +242,9 @@ fn impossible_evaluations() {
     };
     refused(&["--episodes", "0"], "--episodes is 0");
     refused(&["--actors", "0"], "--actors is 0");
+    refused(&["--env", "RepeatPreviousHart"], "RepeatPreviousHart");
+    refused(&["--env", "CountRecallEasy"], "whose observations are MultiDiscrete[2,2]; the agent of");
+    refused(&["--env", "HigherLowerEasy"], "whose observations are Discrete(13); the agent of");
     assert_usage(&["eval", "run", "--episodes", "many"], "--episodes");
     assert_usage(&["eval", "run", "--checkpoint", "bets"], "best");
     let outcome = scene.resume("run", &["--steps", "0"]).expect(2);

@@ -37,6 +37,36 @@ fn eval_is_reproducible_and_never_training() {
 }
 
 #[test]
+fn eval_of_other_difficulties_and_of_likeliest_actions() {
+    let scene = Scene::new();
+    scene.curve("run", &["--steps", "512"]);
+    let drawn = eval(&scene, &["--episodes", "12"]);
+    let greedy = eval(&scene, &["--episodes", "12", "--greedy"]);
+    assert_eq!((&drawn["greedy"], &greedy["greedy"]), (&false.into(), &true.into()));
+    assert_ne!(drawn["mean_return"], greedy["mean_return"]);
+    assert_eq!(greedy, eval(&scene, &["--episodes", "12", "--greedy", "--actors", "2"]));
+
+    let harder = eval(&scene, &["--episodes", "12", "--env", "RepeatPreviousHard"]);
+    assert_eq!(harder["env"], "popgym-RepeatPreviousHard-v0");
+    assert_eq!(harder["trained_on"], "popgym-RepeatPreviousEasy-v0");
+    assert!((harder["mean_length"].as_f64().unwrap() - 155.0).abs() < 1e-9, "{harder}");
+    let text = scene.learner(&["eval", "run", "--env", "RepeatPreviousHard", "--greedy"]).expect(0).stdout;
+    for part in ["RepeatPreviousHard", "trained on popgym-RepeatPreviousEasy-v0", "likeliest actions", "quantiles"] {
+        assert!(text.contains(part), "{part}: {text}");
+    }
+    // Returns in equal parts of their range: each is in one.
+    let counts = drawn["histogram"]["counts"].as_array().unwrap().iter().map(|count| count.as_u64().unwrap());
+    assert_eq!(counts.sum::<u64>(), 12);
+    let edges: Vec<f64> =
+        drawn["histogram"]["edges"].as_array().unwrap().iter().map(|edge| edge.as_f64().unwrap()).collect();
+    assert_eq!(
+        (edges.first().copied(), edges.last().copied()),
+        (drawn["min_return"].as_f64(), drawn["max_return"].as_f64())
+    );
+    assert_eq!(drawn["quantiles"]["50"], drawn["median_return"]);
+}
+
+#[test]
 fn eval_takes_the_checkpoint_asked_for() {
     let scene = Scene::new();
     scene.curve("run", &["--checkpoint-epochs", "1", "--keep-checkpoints", "8"]);
@@ -69,6 +99,7 @@ fn trains(env: &str, id: &str, flags: &[&str]) {
     assert_eq!(curve.lines().count(), 2, "{env} {flags:?}: {curve}");
     assert!(!curve.contains("NaN") && !curve.contains("inf"), "{env} {flags:?}: {curve}");
     assert_eq!(scene.json("run/summary.json")["env"], id);
+    assert!(scene.log_prob_difference("run") < 1e-4, "{env} {flags:?}: actors and learner compute the same");
     let report = eval(&scene, &["--episodes", "2"]);
     assert!((-1.25..=1.0).contains(&report["mean_return"].as_f64().unwrap()), "{env} {flags:?}: {report}");
 }

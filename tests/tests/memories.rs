@@ -50,6 +50,7 @@ fn every_memory_trains_plays_and_is_exported() {
         let curve = scene.curve(memory, &["--memory", memory, "--steps", "1024", "--actors", "2"]);
         assert_eq!(curve.lines().count(), 3, "{memory}: {curve}");
         assert!(!curve.contains("NaN") && !curve.contains("inf"), "{memory}: {curve}");
+        assert!(scene.log_prob_difference(memory) < 1e-4, "{memory}: actors and learner compute the same");
         scene.learner(&["eval", memory, "--episodes", "2"]).expect(0);
         let file = format!("{memory}.pt");
         scene.learner(&["export", memory, "--torchscript", &file]).expect(0);

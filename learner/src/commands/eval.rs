@@ -1,48 +1,75 @@
 //! `learner eval`: episodes played with a trained agent, on streams of their own.
 
+use std::collections::BTreeMap;
+
 use anyhow::Context as _;
 use bytes::Bytes;
+use popgym_envs::Registry;
 use popgym_proto::Episode;
 use serde::Serialize;
 
 use super::{Failure, Outcome, choose_checkpoint, say};
 use crate::Extensions;
 use crate::args::EvalArgs;
-use crate::config::Config;
-use crate::gae::mean_and_variance;
+use crate::config::{Config, Purpose};
 use crate::interrupt::{EXIT_INTERRUPTED, Interrupt};
 use crate::run_dir::RunDir;
 use crate::service::Target;
 use crate::session::Session;
+use crate::space_text::space_text;
+use crate::statistics;
 
 /// What an evaluation found.
 #[derive(Debug, Serialize)]
 struct Report {
     env: String,
+    trained_on: String,
     memory: String,
     checkpoint_epoch: u64,
     seed: u64,
+    greedy: bool,
     episodes: usize,
     mean_return: f64,
     standard_error: f64,
     min_return: f64,
     median_return: f64,
     max_return: f64,
+    /// Of the returns, by per cent.
+    quantiles: BTreeMap<u32, f64>,
+    histogram: Histogram,
     mean_length: f64,
 }
+
+/// How many returns are in each of some equal parts of their range.
+#[derive(Debug, PartialEq, Serialize)]
+struct Histogram {
+    /// One more than there are parts. A return at an edge belongs to the part above it, the largest to the last part.
+    edges: Vec<f64>,
+    counts: Vec<usize>,
+}
+
+/// Per cent of the returns that are shown.
+const QUANTILES: [u32; 5] = [5, 25, 50, 75, 95];
+
+/// Parts of the histogram.
+const BINS: usize = 10;
+
+/// Characters of its longest bar.
+const BAR: usize = 40;
 
 /// Plays `--episodes` episodes with the weights of a checkpoint and prints what they returned.
 ///
 /// # Errors
 /// A directory without a run or without a checkpoint; actors that cannot be started.
 pub fn eval(args: &EvalArgs, extensions: &Extensions) -> Outcome {
-    let config = configure(args, extensions).map_err(Failure::Usage)?;
+    let (config, trained_on) = configure(args, extensions).map_err(Failure::Usage)?;
     let interrupt = Interrupt::listen()?;
     let mut session = Session::new(&config, extensions)?;
     let checkpoint = choose_checkpoint(&args.dir, args.checkpoint, session.parameters())?
         .with_context(|| format!("{} holds no checkpoint yet", args.dir.display()))?;
     session.policy()?.load(&checkpoint.weights).map_err(anyhow::Error::from)?;
-    session.serve(&format!("evaluation-{}", std::process::id()), true)?;
+    let purpose = Purpose::Evaluation { greedy: args.greedy };
+    session.serve(&format!("evaluation-{}", std::process::id()), purpose)?;
     let service = session.service()?;
     let epoch = checkpoint.progress.epoch;
     service.open(0, epoch, Bytes::clone(&checkpoint.weights), Target::Episodes(args.episodes))?;
@@ -55,57 +82,124 @@ pub fn eval(args: &EvalArgs, extensions: &Extensions) -> Outcome {
         }
         return Err(Failure::Run(anyhow::anyhow!("the actors could not do their work")));
     };
-    let report = report(&config, epoch, &collected.episodes);
+    let report = report(&config, trained_on, args.greedy, epoch, &collected.episodes);
     let text =
         if args.json { serde_json::to_string_pretty(&report).map_err(anyhow::Error::from)? } else { lines(&report) };
     say(&text)?;
     Ok(0)
 }
 
-fn configure(args: &EvalArgs, extensions: &Extensions) -> anyhow::Result<Config> {
+/// The configuration of the evaluation, and the id of the environment that the agent was trained on.
+fn configure(args: &EvalArgs, extensions: &Extensions) -> anyhow::Result<(Config, String)> {
     anyhow::ensure!(RunDir::holds_run(&args.dir), "{} holds no run (no config.toml)", args.dir.display());
     anyhow::ensure!(args.episodes > 0, "--episodes is 0, allowed is 1 or more");
     anyhow::ensure!(args.actors > 0, "--actors is 0, allowed is 1 or more");
     let path = RunDir::config_path(&args.dir);
     let mut config = Config::load(&path, &toml::Table::new(), &extensions.envs, &extensions.memories)?;
+    let trained_on = config.env.clone();
+    if let Some(env) = &args.env {
+        extensions.envs.canonical(env)?.clone_into(&mut config.env);
+        check_spaces(&config, &trained_on, &extensions.envs)?;
+    }
     config.seed = args.seed;
     "cpu".clone_into(&mut config.device);
     config.service.actors = args.actors;
     "127.0.0.1:0".clone_into(&mut config.service.listen);
     config.service.metrics_listen.clear();
     config.validate()?;
-    Ok(config)
+    Ok((config, trained_on))
 }
 
-fn report(config: &Config, checkpoint_epoch: u64, episodes: &[Episode]) -> Report {
-    let mut returns: Vec<f64> = episodes.iter().map(Episode::total_return).collect();
-    returns.sort_by(f64::total_cmp);
-    let count = returns.len();
-    let (mean_return, variance) = mean_and_variance(&returns);
+/// An agent can only play what looks like what it was trained on.
+fn check_spaces(config: &Config, trained_on: &str, envs: &Registry) -> anyhow::Result<()> {
+    let spec = |id: &str| anyhow::Ok(envs.get(id)?.observed(config.observability)?);
+    let (here, there) = (spec(&config.env)?, spec(trained_on)?);
+    for (what, here, there) in
+        [("observations", &here.observation, &there.observation), ("actions", &here.action, &there.action)]
+    {
+        let (id, here_text, there_text) = (&config.env, space_text(here), space_text(there));
+        anyhow::ensure!(
+            here == there,
+            "--env is {id}, whose {what} are {here_text}; the agent of {trained_on} knows only {there_text}"
+        );
+    }
+    Ok(())
+}
+
+fn report(config: &Config, trained_on: String, greedy: bool, checkpoint_epoch: u64, episodes: &[Episode]) -> Report {
+    let returns: Vec<f64> = episodes.iter().map(Episode::total_return).collect();
     let steps: usize = episodes.iter().map(|episode| episode.steps).sum();
+    let quantile = |percent: u32| statistics::quantile(&returns, f64::from(percent) / 100.0).unwrap_or(f64::NAN);
+    let standard_deviation = statistics::standard_deviation(&returns);
     Report {
         env: config.env.clone(),
+        trained_on,
         memory: config.memory_name().to_owned(),
         checkpoint_epoch,
         seed: config.seed,
-        episodes: count,
-        mean_return,
-        // Of the mean, from the sample variance; a single episode tells nothing of it.
-        standard_error: if count > 1 { (variance / (count - 1) as f64).sqrt() } else { f64::NAN },
-        min_return: returns[0],
-        median_return: f64::midpoint(returns[(count - 1) / 2], returns[count / 2]),
-        max_return: returns[count - 1],
-        mean_length: steps as f64 / count as f64,
+        greedy,
+        episodes: returns.len(),
+        mean_return: statistics::mean(&returns).unwrap_or(f64::NAN),
+        // Of the mean; a single episode tells nothing of it.
+        standard_error: standard_deviation.map_or(f64::NAN, |deviation| deviation / (returns.len() as f64).sqrt()),
+        min_return: quantile(0),
+        median_return: quantile(50),
+        max_return: quantile(100),
+        quantiles: QUANTILES.map(|percent| (percent, quantile(percent))).into(),
+        histogram: histogram(&returns),
+        mean_length: steps as f64 / returns.len() as f64,
     }
 }
 
+fn histogram(returns: &[f64]) -> Histogram {
+    let least = returns.iter().copied().fold(f64::INFINITY, f64::min);
+    let width = returns.iter().copied().fold(f64::NEG_INFINITY, f64::max) - least;
+    // All returns may be equal.
+    let bins = if width > 0.0 { BINS } else { 1 };
+    let mut counts = vec![0; bins];
+    for value in returns {
+        let bin = if width > 0.0 { ((value - least) / width * bins as f64) as usize } else { 0 };
+        counts[bin.min(bins - 1)] += 1;
+    }
+    Histogram { edges: (0..=bins).map(|edge| least + width * edge as f64 / bins as f64).collect(), counts }
+}
+
 fn lines(report: &Report) -> String {
-    [
-        format!("{} on {}, weights of epoch {}", report.memory, report.env, report.checkpoint_epoch),
+    let other =
+        if report.trained_on == report.env { String::new() } else { format!(", trained on {}", report.trained_on) };
+    let how = if report.greedy { ", likeliest actions" } else { "" };
+    let quantiles: Vec<String> =
+        report.quantiles.iter().map(|(percent, value)| format!("{percent}%: {value:.4}")).collect();
+    let mut lines = vec![
+        format!("{} on {}, weights of epoch {}{other}{how}", report.memory, report.env, report.checkpoint_epoch),
         format!("episodes           {} (seed {})", report.episodes, report.seed),
         format!("mean return        {:.4} +- {:.4} (standard error)", report.mean_return, report.standard_error),
         format!("min, median, max   {:.4}  {:.4}  {:.4}", report.min_return, report.median_return, report.max_return),
+        format!("quantiles          {}", quantiles.join("  ")),
         format!("mean length        {:.1} steps", report.mean_length),
-    ]
-    .join("\n")
+    ];
+    let Histogram { edges, counts } = &report.histogram;
+    let most = counts.iter().max().copied().unwrap_or(1).max(1);
+    for (edge, count) in edges.windows(2).zip(counts) {
+        let bar = "#".repeat((count * BAR).div_ceil(most));
+        lines.push(format!("{:>8.3} .. {:>6.3}  {count:>6}  {bar}", edge[0], edge[1]).trim_end().to_owned());
+    }
+    lines.join("\n")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_return_is_in_one_part() {
+        // Eleven values a tenth of the range apart: one at each edge; the largest belongs to the last part.
+        let returns: Vec<f64> = (0..=10).map(|i| f64::from(i) * 0.5 - 1.0).collect();
+        let Histogram { edges, counts } = histogram(&returns);
+        assert_eq!(counts, [1, 1, 1, 1, 1, 1, 1, 1, 1, 2]);
+        assert_eq!(edges.len(), 11);
+        assert!((edges[0] + 1.0).abs() < 1e-12 && (edges[10] - 4.0).abs() < 1e-12 && (edges[1] + 0.5).abs() < 1e-12);
+        assert_eq!(histogram(&[0.25; 7]), Histogram { edges: vec![0.25, 0.25], counts: vec![7] });
+        assert_eq!(histogram(&[-1.0, 1.0]).counts, [1, 0, 0, 0, 0, 0, 0, 0, 0, 1]);
+    }
 }

@@ -6,17 +6,23 @@ use std::path::Path;
 use crate::args::Which;
 use crate::checkpoint::{self, Checkpoint};
 
+mod compare;
 mod eval;
 mod export;
 mod list;
 mod play;
+mod report;
+mod study;
 mod train;
 mod watch;
 
+pub use compare::{CompareArgs, compare};
 pub use eval::eval;
 pub use export::export;
 pub use list::list;
 pub use play::play;
+pub use report::{ReportArgs, report};
+pub use study::{StudyListArgs, StudyRunArgs, study_list, study_run};
 pub use train::{resume, train};
 pub use watch::watch;
 

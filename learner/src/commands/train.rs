@@ -8,7 +8,7 @@ use super::{Failure, Outcome, say};
 use crate::Extensions;
 use crate::args::{ResumeArgs, TrainArgs};
 use crate::checkpoint::Checkpoint;
-use crate::config::{self, Config};
+use crate::config::{self, Config, Purpose};
 use crate::files;
 use crate::interrupt::{EXIT_INTERRUPTED, Interrupt};
 use crate::manifest;
@@ -33,13 +33,13 @@ pub fn train(args: &TrainArgs, extensions: Extensions) -> Outcome {
         }
         let dir = continue_run(&path, &config, &extensions)?;
         let session = Session::new(&config, &extensions)?;
-        return carry_out(&dir, session, &config, extensions);
+        return carry_out(&dir, session, &config, extensions, args.with_parent);
     }
     // What can fail for want of an address or a program does so before there is a directory.
     let mut session = Session::new(&config, &extensions)?;
     session.listen()?;
     let dir = RunDir::create(&path, &config)?;
-    carry_out(&dir, session, &config, extensions)
+    carry_out(&dir, session, &config, extensions, args.with_parent)
 }
 
 /// Continues the run of a directory from its last checkpoint, or from the beginning if it has none.
@@ -58,7 +58,7 @@ pub fn resume(args: &ResumeArgs, extensions: Extensions) -> Outcome {
     let mut config = load(&flags).map_err(Failure::Usage)?;
     resolve_device(&mut config).map_err(Failure::Usage)?;
     let session = Session::new(&config, &extensions)?;
-    carry_out(&dir, session, &config, extensions)
+    carry_out(&dir, session, &config, extensions, false)
 }
 
 fn configure(args: &TrainArgs, extensions: &Extensions) -> anyhow::Result<Config> {
@@ -97,8 +97,17 @@ fn continue_run(path: &Path, config: &Config, extensions: &Extensions) -> Result
 }
 
 /// Runs what `config` says in `dir`, from the directory's last checkpoint if it has one.
-fn carry_out(dir: &RunDir, mut session: Session<'_>, config: &Config, extensions: Extensions) -> Outcome {
+fn carry_out(
+    dir: &RunDir,
+    mut session: Session<'_>,
+    config: &Config,
+    extensions: Extensions,
+    with_parent: bool,
+) -> Outcome {
     let interrupt = Interrupt::listen()?;
+    if with_parent {
+        interrupt.with_parent()?;
+    }
     let rows = MetricsCsv::read(dir.path()).map_or(0, |rows| rows.len() as u64);
     let checkpoint = Checkpoint::latest(&dir.checkpoints(), session.parameters(), rows)?;
     if let Some(path) = complete(dir, config, checkpoint.as_ref()) {
@@ -109,7 +118,7 @@ fn carry_out(dir: &RunDir, mut session: Session<'_>, config: &Config, extensions
     files::write(&RunDir::config_path(dir.path()), &config.to_toml()?)?;
     let (policy, behaviour) = (session.first_policy()?, session.policy()?);
     let observers = observers(dir, config, checkpoint.as_ref(), extensions.observers)?;
-    session.serve(dir.run(), false)?;
+    session.serve(dir.run(), Purpose::Training)?;
     let trainer = Trainer {
         config,
         action: session.env().action.clone(),

@@ -1,67 +1,24 @@
 //! The picture of a learning curve.
 
 use std::error::Error;
-use std::ops::Range;
 use std::path::Path;
 
-use anyhow::anyhow;
 use plotters::coord::Shift;
 use plotters::prelude::*;
-use plotters::style::{FontFamily, FontStyle, register_font};
 
 use super::EpochMetrics;
+use crate::chart::{BAND, BITMAP, GRID, OVERSAMPLING, Pen, TEXT, VECTOR, register, short, value_range};
 
 /// Width and height of the picture.
 const SIZE: (u32, u32) = (1200, 720);
 
-/// The PNG is drawn this much larger in both directions, and averaged: its lines are smooth.
-const OVERSAMPLING: u32 = 3;
-
-/// Name under which the font is known here, and a list of families where the SVG is viewed.
-const FONT: FontFamily<'static> = FontFamily::Name("DejaVu Sans, Verdana, sans-serif");
-
 const MEAN: RGBColor = RGBColor(31, 90, 166);
 const MMER: RGBColor = RGBColor(213, 94, 0);
-const TEXT: RGBColor = RGBColor(40, 40, 40);
-/// Opacity of the band from smallest to largest return.
-const BAND: f64 = 0.18;
-
-const GRID: RGBColor = RGBColor(226, 226, 226);
-
-/// What differs between the backends.
-struct Pen {
-    /// Every length is this much larger.
-    scale: u32,
-    /// Size, in the backend's measure, of a font of 1 em.
-    em: f64,
-    /// What has to be added, in ems, for text to stand where it should.
-    drop: f64,
-}
-
-/// plotters divides sizes of fonts by 1.24 in an SVG.
-const VECTOR: Pen = Pen { scale: 1, em: 1.24, drop: 0.0 };
-
-/// In a bitmap they are the distance from ascender to descender, 1.164 em here; and text comes out too high.
-const BITMAP: Pen = Pen { scale: OVERSAMPLING, em: 1.164, drop: 0.2 };
-
-impl Pen {
-    fn px(&self, length: u32) -> u32 {
-        length * self.scale
-    }
-
-    fn text(&self, size: u32) -> TextStyle<'static> {
-        (FONT, f64::from(self.px(size)) * self.em).into_font().color(&TEXT)
-    }
-
-    fn drop(&self, size: u32) -> i32 {
-        (f64::from(self.px(size)) * self.drop) as i32
-    }
-}
 
 /// The chart as an SVG.
 pub(super) fn svg(title: &str, rows: &[EpochMetrics]) -> anyhow::Result<String> {
     let mut text = String::new();
-    chart(&SVGBackend::with_string(&mut text, SIZE).into_drawing_area(), &VECTOR, title, rows)?;
+    chart(&SVGBackend::with_string(&mut text, SIZE).into_drawing_area(), VECTOR, title, rows)?;
     Ok(text)
 }
 
@@ -78,7 +35,7 @@ pub(super) fn png(path: &Path, title: &str, rows: &[EpochMetrics]) -> anyhow::Re
 fn pixels(title: &str, rows: &[EpochMetrics]) -> anyhow::Result<Vec<u8>> {
     let (width, height) = (SIZE.0 * OVERSAMPLING, SIZE.1 * OVERSAMPLING);
     let mut fine = vec![0; (width * height * 3) as usize];
-    chart(&BitMapBackend::with_buffer(&mut fine, (width, height)).into_drawing_area(), &BITMAP, title, rows)?;
+    chart(&BitMapBackend::with_buffer(&mut fine, (width, height)).into_drawing_area(), BITMAP, title, rows)?;
 
     let (side, line) = (OVERSAMPLING as usize, width as usize * 3);
     let mean = |i: usize| {
@@ -92,14 +49,14 @@ fn pixels(title: &str, rows: &[EpochMetrics]) -> anyhow::Result<Vec<u8>> {
 
 fn chart<B: DrawingBackend>(
     area: &DrawingArea<B, Shift>,
-    pen: &Pen,
+    pen: Pen,
     title: &str,
     rows: &[EpochMetrics],
 ) -> anyhow::Result<()>
 where
     B::ErrorType: Error + Send + Sync + 'static,
 {
-    register_font(FONT.as_str(), FontStyle::Normal, dejavu::sans::regular()).map_err(|_| anyhow!("invalid font"))?;
+    register()?;
     let px = |length| pen.px(length);
     area.fill(&WHITE)?;
     let (head, plot) = area.split_vertically(px(84));
@@ -113,13 +70,14 @@ where
     let (least, most) = (points(|row| row.min_return), points(|row| row.max_return));
     let steps = rows.last().map_or(1.0, |row| row.env_steps as f64) * if rows.len() == 1 { 2.0 } else { 1.01 };
 
+    let values = [&mean, &least, &most, &mmer].into_iter().flatten().map(|(_, y)| *y);
     let mut chart = ChartBuilder::on(&plot)
         .margin_right(px(40))
         .margin_bottom(px(12))
         .margin_left(px(16))
         .x_label_area_size(px(58))
         .y_label_area_size(px(84))
-        .build_cartesian_2d(0.0..steps, value_range([&mean, &least, &most, &mmer]))?;
+        .build_cartesian_2d(0.0..steps, value_range(values))?;
     chart
         .configure_mesh()
         .light_line_style(TRANSPARENT)
@@ -155,15 +113,14 @@ where
 }
 
 /// Title and legend.
-fn draw_head<B: DrawingBackend>(area: &DrawingArea<B, Shift>, pen: &Pen, title: &str, mmer: &str) -> anyhow::Result<()>
+fn draw_head<B: DrawingBackend>(area: &DrawingArea<B, Shift>, pen: Pen, title: &str, mmer: &str) -> anyhow::Result<()>
 where
     B::ErrorType: Error + Send + Sync + 'static,
 {
     let px = |length: u32| pen.px(length) as i32;
     area.draw_text(title, &pen.text(24), (px(100), px(16) + pen.drop(24)))?;
     let font = pen.text(15);
-    // Widths are measured as the bitmap draws.
-    let ruler = Pen { em: BITMAP.em, ..*pen }.text(15);
+    let ruler = pen.ruler(15);
     let entries = [
         ("mean of an epoch's episodes", MEAN.filled(), 1),
         ("smallest to largest", MEAN.mix(BAND).filled(), 7),
@@ -178,30 +135,6 @@ where
         x += area.estimate_text_size(text, &ruler)?.0 as i32 + px(40);
     }
     Ok(())
-}
-
-/// A range that contains all values, with room around them, also around a constant.
-fn value_range(series: [&[(f64, f64)]; 4]) -> Range<f64> {
-    let values = || series.into_iter().flatten().map(|(_, y)| *y);
-    let (least, most) = (values().fold(f64::INFINITY, f64::min), values().fold(f64::NEG_INFINITY, f64::max));
-    if least > most {
-        return -1.0..1.0;
-    }
-    let room = if most > least { 0.05 * (most - least) } else { 0.5_f64.max(0.05 * most.abs()) };
-    least - room..most + room
-}
-
-/// A number as a label of an axis: 2000000 is 2M, 0.30000000000000004 is 0.3.
-fn short(value: f64) -> String {
-    let (value, unit) = match value.abs() {
-        1e9.. => (value / 1e9, "G"),
-        1e6.. => (value / 1e6, "M"),
-        1e3.. => (value / 1e3, "k"),
-        _ => (value, ""),
-    };
-    let rounded = (value * 1e4).round() / 1e4;
-    // No negative zero.
-    format!("{}{unit}", rounded + 0.0)
 }
 
 #[cfg(test)]
@@ -270,11 +203,5 @@ mod tests {
             (row.mean_return, row.min_return, row.max_return, row.mmer) = (f64::NAN, f64::NAN, f64::NAN, f64::NAN);
         }
         assert!(svg("not a number at all", &rows).is_ok());
-    }
-
-    #[test]
-    fn labels_are_short() {
-        let labels = [0.0, -1e-9, 0.1 + 0.2, -0.75, 65_536.0, 2e6, 1.5e7, 3e9].map(short);
-        assert_eq!(labels, ["0", "0", "0.3", "-0.75", "65.536k", "2M", "15M", "3G"]);
     }
 }

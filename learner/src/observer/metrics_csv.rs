@@ -7,7 +7,7 @@ use super::{EpochMetrics, EpochReport, Observer};
 
 impl Row for EpochMetrics {
     const FILE: &'static str = "metrics.csv";
-    const HEADER: &'static str = "epoch,env_steps,episodes,mean_return,min_return,max_return,mean_length,mmer,\
+    const HEADER: &'static str = "epoch,env_steps,episodes,mean_return,epoch_return,min_return,max_return,mean_length,mmer,\
         policy_loss,value_loss,kl,kl_coef,entropy,explained_variance,grad_norm,learning_rate,valid_fraction";
     const COMPLETE: bool = true;
 
@@ -20,6 +20,11 @@ impl Row for EpochMetrics {
 pub struct MetricsCsv(CsvTable<EpochMetrics>);
 
 impl MetricsCsv {
+    /// The file's name in the run directory.
+    pub const FILE: &str = EpochMetrics::FILE;
+    /// Its first line: the names of the columns.
+    pub const HEADER: &str = EpochMetrics::HEADER;
+
     /// Opens the file in `dir` for a run that has completed `epochs` epochs.
     ///
     /// For 0 epochs the file is made anew. Otherwise the rows of these epochs are kept and whatever follows is cut.
@@ -76,7 +81,7 @@ mod tests {
         assert_eq!(bytes(&whole), bytes(&resumed));
         assert_eq!(
             bytes(&whole).lines().nth(2).unwrap(),
-            "1,2000,20,-0.25,-1.0,0.5,48.0,-0.25,0.01,0.5,0.002,0.2,1.25,0.75,3.5,0.00005,0.9"
+            "1,2000,20,-0.25,-0.125,-1.0,0.5,48.0,-0.25,0.01,0.5,0.002,0.2,1.25,0.75,3.5,0.00005,0.9"
         );
         let rows = MetricsCsv::read(whole.path()).unwrap();
         assert_eq!(rows, (0..5).map(|epoch| report(epoch).metrics).collect::<Vec<_>>());

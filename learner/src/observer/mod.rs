@@ -13,7 +13,7 @@ mod metrics_csv;
 mod progress;
 mod prometheus;
 #[cfg(test)]
-mod samples;
+pub(crate) mod samples;
 mod summary_json;
 mod tensorboard;
 mod timing_csv;
@@ -21,6 +21,7 @@ mod timing_csv;
 pub use curve::Curve;
 pub use metrics_csv::MetricsCsv;
 pub use progress::Progress;
+pub(crate) use progress::clock;
 pub use prometheus::Prometheus;
 pub use summary_json::SummaryJson;
 pub use tensorboard::TensorBoard;
@@ -62,6 +63,8 @@ pub struct EpochMetrics {
     pub episodes: u64,
     /// Mean return of the epoch's episodes, or of the last 100 episodes if the epoch has fewer.
     pub mean_return: f64,
+    /// Mean return of the epoch's episodes, however few.
+    pub epoch_return: f64,
     /// Smallest return in the epoch.
     pub min_return: f64,
     /// Largest return in the epoch.

@@ -55,6 +55,11 @@ impl Progress {
         Self { dir: PathBuf::new(), total_steps: 0, seconds_per_step: None, checkpoint: None, view }
     }
 
+    /// All bars of the process: log lines are drawn above whatever is among them.
+    pub(crate) fn bars() -> &'static MultiProgress {
+        &BARS
+    }
+
     /// Writes to stderr, above the bar if there is one: `tracing_subscriber::fmt().with_writer(Progress::log_writer)`.
     pub fn log_writer() -> impl Write {
         LogWriter
@@ -190,7 +195,7 @@ fn describe(summary: &Summary, dir: &Path, checkpoint: Option<&Path>) -> String 
 }
 
 /// Seconds as `m:ss`, `h:mm:ss`.
-fn clock(seconds: f64) -> String {
+pub(crate) fn clock(seconds: f64) -> String {
     let seconds = seconds.max(0.0).round() as u64;
     let (hours, minutes, seconds) = (seconds / 3600, seconds / 60 % 60, seconds % 60);
     if hours > 0 { format!("{hours}:{minutes:02}:{seconds:02}") } else { format!("{minutes}:{seconds:02}") }

@@ -20,7 +20,7 @@ pub(super) fn start(dir: &Path, epoch: u64) -> RunStart {
 }
 
 /// Epoch `epoch` of that run: 1000 steps, 10 episodes and 2 seconds; the mean return is a quarter more each epoch.
-pub(super) fn report(epoch: u64) -> EpochReport {
+pub(crate) fn report(epoch: u64) -> EpochReport {
     let mean_return = -0.5 + 0.25 * epoch as f64;
     let env_steps = 1000 * (epoch + 1);
     EpochReport {
@@ -29,6 +29,7 @@ pub(super) fn report(epoch: u64) -> EpochReport {
             env_steps,
             episodes: 10 * (epoch + 1),
             mean_return,
+            epoch_return: mean_return + 0.125,
             min_return: mean_return - 0.75,
             max_return: mean_return + 0.75,
             mean_length: 48.0,
@@ -60,7 +61,7 @@ pub(super) fn report(epoch: u64) -> EpochReport {
 }
 
 /// The end of that run after `epochs` epochs.
-pub(super) fn summary(epochs: u64) -> Summary {
+pub(crate) fn summary(epochs: u64) -> Summary {
     let last = epochs.checked_sub(1).map(|epoch| report(epoch).metrics);
     Summary {
         env: "RepeatPreviousEasy".into(),

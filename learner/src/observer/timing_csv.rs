@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-use super::csv_table::{CsvTable, Row};
+use super::csv_table::{self, CsvTable, Row};
 use super::{EpochReport, EpochTiming, Observer};
 
 impl Row for EpochTiming {
@@ -29,6 +29,14 @@ impl TimingCsv {
     /// If the file cannot be written or has other columns.
     pub fn open(dir: &Path, epochs: u64) -> anyhow::Result<Self> {
         CsvTable::open(dir, epochs).map(Self)
+    }
+
+    /// Reads the rows of the file in `dir`, without a torn last line.
+    ///
+    /// # Errors
+    /// If there is no such file, it has other columns, or a line is no row.
+    pub fn read(dir: &Path) -> anyhow::Result<Vec<EpochTiming>> {
+        csv_table::read(dir)
     }
 }
 

@@ -27,6 +27,7 @@ fn service() -> Service {
         lag: 0,
         rows: 16,
         evaluation: false,
+        greedy: false,
     };
     let episodes =
         EpisodeSpec { observation: Space::Discrete(256), action: Space::MultiDiscrete(vec![4]), max_steps: MAX_STEPS };

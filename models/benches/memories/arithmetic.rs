@@ -31,9 +31,21 @@ pub(crate) fn mean(values: &[f64]) -> f64 {
 
 /// The middle value, or the mean of the two middle ones.
 pub(crate) fn median(values: &[f64]) -> f64 {
+    quantile(values, 0.5)
+}
+
+/// Lower and upper quartile: half of the values lie between them.
+pub(crate) fn quartiles(values: &[f64]) -> [f64; 2] {
+    [0.25, 0.75].map(|p| quantile(values, p))
+}
+
+/// By linear interpolation between the sorted values.
+fn quantile(values: &[f64], p: f64) -> f64 {
     let mut values = values.to_vec();
     values.sort_by(f64::total_cmp);
-    f64::midpoint(values[(values.len() - 1) / 2], values[values.len() / 2])
+    let place = p * (values.len() - 1) as f64;
+    let (low, high) = (values[place.floor() as usize], values[place.ceil() as usize]);
+    low + (high - low) * place.fract()
 }
 
 /// The 97.5% quantile of Student's distribution.

@@ -8,7 +8,7 @@ use std::time::Duration;
 use serde::{Deserialize, Serialize};
 use tch::Device;
 
-use crate::arithmetic::median;
+use crate::arithmetic::{median, quartiles};
 use crate::measure::Subject;
 use crate::options::Shape;
 
@@ -66,6 +66,8 @@ pub(crate) struct Comparison {
     pub(crate) eager: Vec<f64>,
     /// Median over turns of eager's seconds by ours.
     pub(crate) ratio: f64,
+    /// Its quartiles over turns.
+    pub(crate) ratio_quartiles: [f64; 2],
 }
 
 impl Eager {
@@ -142,6 +144,7 @@ impl Comparison {
             }
         }
         let ratios: Vec<f64> = ours.iter().zip(&theirs).map(|(ours, eager)| eager / ours).collect();
-        Ok(Self { memory: memory.to_owned(), work, ours, eager: theirs, ratio: median(&ratios) })
+        let (ratio, ratio_quartiles) = (median(&ratios), quartiles(&ratios));
+        Ok(Self { memory: memory.to_owned(), work, ours, eager: theirs, ratio, ratio_quartiles })
     }
 }

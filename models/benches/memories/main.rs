@@ -25,7 +25,7 @@
 //! `--python PYTHON`, an interpreter with torch, adds a comparison with `eager.py`, the same memories as one would write them
 //! in PyTorch: passes (training without Adam) and steps of 1, 64 and 256 rows. Both do the same work in turns, `--repeats` of
 //! them, so that whatever else the machine does meets both; rates are medians over the turns, the ratio is the median of
-//! each turn's (above 1: faster than eager). steps/s are rows a second.
+//! each turn's (above 1: faster than eager), and half of the turns lie within the numbers in brackets. steps/s are rows a second.
 //!
 //! libtorch's threads wait for one another without sleeping: on a machine with other work, training on all cores takes many
 //! times its time unless OMP_WAIT_POLICY=passive is set (for both sides).

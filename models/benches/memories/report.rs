@@ -107,7 +107,9 @@ impl Report {
                 continue;
             };
             let (ours, eager) = (median(&comparison.ours), median(&comparison.eager));
-            let (name, ratio) = (figures.paper_name.clone(), format!("{:.2}", comparison.ratio));
+            let [low, high] = comparison.ratio_quartiles;
+            let ratio = format!("{:.2} ({low:.2} to {high:.2})", comparison.ratio);
+            let name = figures.paper_name.clone();
             match comparison.work {
                 Work::Pass(shape) => {
                     let operations = pass_operations(figures.matrix_weights, shape.rows());

@@ -51,7 +51,7 @@ pub(super) const SMALL: f64 = 1e-6;
 #[derive(Clone, Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct DncOptions {
-    /// Width of the controller's state and of the output; the paper's is 256.
+    /// Width of the controller's state and of the output, 1 to 4,096; the paper's is 256.
     pub hidden_size: i64,
     /// Number of memory cells; the paper's is 16.
     pub cells: i64,
@@ -91,10 +91,10 @@ impl MemoryKind for Dnc {
     type Options = DncOptions;
 
     fn new(path: &Path<'_>, input_width: i64, options: &DncOptions) -> Result<Self, String> {
-        let hidden = super::check_size("hidden_size", options.hidden_size)?;
-        let cells = check("cells", options.cells, 512)?;
-        let width = check("cell_size", options.cell_size, 512)?;
-        let heads = check("read_heads", options.read_heads, 64)?;
+        let hidden = super::check_hidden_size(options.hidden_size)?;
+        let cells = super::check_size("cells", options.cells, 512)?;
+        let width = super::check_size("cell_size", options.cell_size, 512)?;
+        let heads = super::check_size("read_heads", options.read_heads, 64)?;
         let (gates, reads, interface) = (4 * hidden, heads * width, interface_width(width, heads));
         let init = uniform(hidden);
         Ok(Self {
@@ -112,10 +112,6 @@ impl MemoryKind for Dnc {
             bias_output: path.var("bias_output", &[hidden], uniform(hidden + reads)),
         })
     }
-}
-
-fn check(key: &str, value: i64, most: i64) -> Result<i64, String> {
-    if (1..=most).contains(&value) { Ok(value) } else { Err(format!("`{key}` is {value}, allowed is 1..={most}")) }
 }
 
 fn interface_width(width: i64, heads: i64) -> i64 {
@@ -172,7 +168,11 @@ impl Memory for Dnc {
     }
 
     fn act(&self, input: &Tensor, state: &State) -> (Tensor, State) {
-        if on_cpu(input) { dnc_cpu::act(self, input, state) } else { tch::no_grad(|| self.step(input, state)) }
+        if on_cpu(input) && input.size()[0] > 0 {
+            dnc_cpu::act(self, input, state)
+        } else {
+            tch::no_grad(|| self.step(input, state))
+        }
     }
 
     fn scan(&self, input: &Tensor, packing: &Packing, state: &State) -> Scan {

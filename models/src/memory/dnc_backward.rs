@@ -69,12 +69,8 @@ impl Scratch {
 }
 
 widest! {
-    fn wide(s: Sizes, rows: Rows<'_>, scratch: &mut Scratch) = of_any_size
-}
-
-/// Gradients of one time step of some rows.
-pub(super) fn step(s: Sizes, rows: Rows<'_>, scratch: &mut Scratch) {
-    wide(s, rows, scratch);
+    /// Gradients of one time step of some rows.
+    pub(super) fn step(s: Sizes, rows: Rows<'_>, scratch: &mut Scratch) = of_any_size
 }
 
 #[inline(always)]
@@ -248,7 +244,7 @@ fn connect(s: Sizes, before: [&[f32]; FIELDS], w: &[f32], gradients: &mut [&mut 
     let [_, d_link, d_precedence, _, d_next_w, _] = gradients;
     let n = s.cells;
     let (kept, mean) = (1.0 - sum!(n, i => w[i]), dot(d_precedence, precedence));
-    for (((d_w, next), d_precedence), ..) in d_w.iter_mut().zip(&**d_next_w).zip(&mut **d_precedence).zip(w) {
+    for ((d_w, next), d_precedence) in d_w.iter_mut().zip(&**d_next_w).zip(&mut **d_precedence) {
         *d_w = next + (*d_precedence - mean);
         *d_precedence *= kept;
     }

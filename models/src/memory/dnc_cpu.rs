@@ -15,13 +15,12 @@
 // Only inlined code is compiled for the caller's instruction set.
 #![allow(clippy::inline_always)]
 
-use std::ops::Range;
-
-use tch::{Device, Kind, Tensor};
+use tch::{Kind, Tensor};
 
 use super::dnc::Dnc;
 use super::dnc_cells::{FIELDS, Sizes};
 use super::elementwise::{floats, floats_mut, sigmoid, tanh, widest};
+use super::trajectory::{Step, Trajectory, empty, narrow};
 use super::{Backward, Scan, State, add_gradients, dnc_backward, dnc_forward};
 use crate::packing::Packing;
 
@@ -32,14 +31,6 @@ fn contiguous(state: &State) -> Vec<Tensor> {
 
 fn fields(state: &[Tensor]) -> [&[f32]; FIELDS] {
     std::array::from_fn(|field| floats(&state[2 + field]))
-}
-
-fn empty(rows: i64, width: usize) -> Tensor {
-    Tensor::empty([rows, width as i64], (Kind::Float, Device::Cpu))
-}
-
-fn narrow(tensor: &Tensor, rows: &Range<usize>) -> Tensor {
-    tensor.narrow(0, rows.start as i64, rows.len() as i64)
 }
 
 /// One time step, without gradients.
@@ -77,8 +68,8 @@ pub(super) fn scan(dnc: &Dnc, input: &Tensor, packing: &Packing, initial: &State
     tch::no_grad(|| {
         let mut tape = Tape::new(dnc, input, packing, initial);
         tape.forward(dnc);
-        let output = dnc.bias_output.addmm(&tape.z, &dnc.weight_output.tr());
-        let state = tape.last(dnc, &packing.last_rows());
+        let output = dnc.bias_output.addmm(&tape.z.after(), &dnc.weight_output.tr());
+        let state = tape.last(dnc, &packing.last_rows(), initial);
         let backward = input.requires_grad().then(|| {
             let dnc = dnc.shallow_clone();
             Box::new(move |grad_output: &Tensor| tape.backward(&dnc, grad_output)) as Backward
@@ -109,39 +100,35 @@ impl Dnc {
 
 /// All that the steps compute, a row for each packed row.
 struct Tape {
-    steps: Vec<Range<usize>>,
+    steps: Vec<Step>,
     input: Tensor,
-    initial: Vec<Tensor>,
-    /// Controller's output and read vectors: before the first step, and after each.
-    z_initial: Tensor,
-    z: Tensor,
+    /// Controller's output and read vectors.
+    z: Trajectory,
     /// Gates; then their gradients.
     a: Tensor,
     /// Interface; then its gradients.
     xi: Tensor,
-    /// The LSTM's cells and the memory's fields after each step.
-    c: Vec<f32>,
-    fields: [Vec<f32>; FIELDS],
+    /// The LSTM's cells.
+    c: Trajectory,
+    /// The memory's fields.
+    fields: [Trajectory; FIELDS],
     trace: Vec<f32>,
 }
 
 impl Tape {
     fn new(dnc: &Dnc, input: &Tensor, packing: &Packing, initial: &State) -> Self {
         let (s, rows) = (dnc.sizes(), packing.rows());
-        let initial = contiguous(initial);
-        let zeros = |width: usize| vec![0.0; rows as usize * width];
         let weight = dnc.weight_input.narrow(1, 0, dnc.inputs());
+        let initial = &initial.0;
         Self {
-            steps: packing.steps().collect(),
+            steps: Step::all(packing),
             input: input.detach(),
-            z_initial: Tensor::cat(&[&initial[0], &initial[8]], 1),
-            initial,
-            z: empty(rows, dnc.hidden as usize + s.reads()),
+            z: Trajectory::new(packing, &Tensor::cat(&[&initial[0], &initial[8]], 1)),
             a: dnc.bias().addmm(input, &weight.tr()),
             xi: empty(rows, s.interface()),
-            c: zeros(dnc.hidden as usize),
-            fields: s.fields().map(zeros),
-            trace: zeros(s.trace()),
+            c: Trajectory::new(packing, &initial[1]),
+            fields: std::array::from_fn(|field| Trajectory::new(packing, &initial[2 + field].flatten(1, -1))),
+            trace: vec![0.0; rows as usize * s.trace()],
         }
     }
 
@@ -149,46 +136,33 @@ impl Tape {
         let (s, hidden) = (dnc.sizes(), dnc.hidden as usize);
         let (recurrent, interface) = (dnc.recurrent().tr(), dnc.weight_interface.tr());
         let mut scratch = dnc_forward::Scratch::new(s);
-        let mut before = self.z_initial.shallow_clone();
-        let mut previous = 0..0;
-        for now in &self.steps {
-            let [mut a, mut z, mut xi] = [&self.a, &self.z, &self.xi].map(|x| narrow(x, now));
-            let _ = a.addmm_(&narrow(&before, &(0..now.len())), &recurrent);
-            let (c_before, c) = at(&mut self.c, floats(&self.initial[1]), &previous, now, hidden);
+        for step in &self.steps {
+            let now = &step.now;
+            let [mut a, mut xi] = [&self.a, &self.xi].map(|x| narrow(x, now));
+            let mut z = self.z.after_step(step);
+            let _ = a.addmm_(&self.z.before(step), &recurrent);
+            let (c_before, c) = self.c.slices(step);
             lstm(floats_mut(&mut a), c_before, c, floats_mut(&mut z), hidden);
             let _ = dnc.bias_interface.addmm_out(&xi, &z.narrow(1, 0, dnc.hidden), &interface);
 
-            let (mut initial, mut widths) = (fields(&self.initial).into_iter(), s.fields().into_iter());
-            let pairs = self.fields.each_mut().map(|field| {
-                let (initial, width) = initial.next().zip(widths.next()).expect("one for each field");
-                at(field, initial, &previous, now, width)
-            });
-            let trace = &mut self.trace[now.start * s.trace()..now.end * s.trace()];
+            let pairs = self.fields.each_mut().map(|field| field.slices(step));
             let rows = dnc_forward::Rows {
                 before: pairs.each_ref().map(|(before, _)| *before),
                 after: pairs.map(|(_, after)| after),
                 xi: floats_mut(&mut xi),
                 z: floats_mut(&mut z),
-                trace,
+                trace: &mut self.trace[now.start * s.trace()..now.end * s.trace()],
             };
             dnc_forward::step(s, rows, &mut scratch);
-            (before, previous) = (z, now.clone());
         }
     }
 
-    /// The state after each sequence's last step, which is in these rows.
-    fn last(&self, dnc: &Dnc, rows: &Tensor) -> State {
-        let sequences = rows.size()[0];
-        let indices: Vec<i64> = rows.try_into().expect("a vector");
-        let gather = |x: &[f32], shape: &[i64]| {
-            let width = shape.iter().product::<i64>() as usize;
-            let rows = indices.iter().flat_map(|&row| &x[row as usize * width..][..width]);
-            Tensor::from_slice(&rows.copied().collect::<Vec<f32>>()).view(&[&[sequences], shape].concat()[..])
-        };
-        let z = self.z.index_select(0, rows);
-        let mut state = vec![z.narrow(1, 0, dnc.hidden).contiguous(), gather(&self.c, &[dnc.hidden])];
-        for (field, like) in self.fields.iter().zip(&self.initial[2..]) {
-            state.push(gather(field, &like.size()[1..]));
+    /// The state after each sequence's last step, which is in these rows; in the shapes of the initial one.
+    fn last(&self, dnc: &Dnc, rows: &Tensor, initial: &State) -> State {
+        let z = self.z.after().index_select(0, rows);
+        let mut state = vec![z.narrow(1, 0, dnc.hidden).contiguous()];
+        for (numbers, like) in [&self.c].into_iter().chain(&self.fields).zip(&initial.0[1..]) {
+            state.push(numbers.after().index_select(0, rows).view_as(like));
         }
         state.push(z.narrow(1, dnc.hidden, dnc.heads * dnc.width).contiguous());
         State(state)
@@ -202,12 +176,12 @@ impl Tape {
             self.backward_steps(dnc, &grad_output.mm(&dnc.weight_output), &recurrent);
             let sum = |x: &Tensor| x.sum_dim_intlist(0, false, Kind::Float);
             let (da, dxi) = (&self.a, &self.xi);
-            let d_recurrent = da.tr().mm(&self.z_before());
+            let d_recurrent = da.tr().mm(&self.z.all_before(&self.steps));
             let (inputs, reads) = (dnc.inputs(), dnc.heads * dnc.width);
             let d_input = Tensor::cat(&[da.tr().mm(&self.input), d_recurrent.narrow(1, dnc.hidden, reads)], 1);
             let d_state = d_recurrent.narrow(1, 0, dnc.hidden).contiguous();
-            let d_interface = dxi.tr().mm(&self.z.narrow(1, 0, dnc.hidden));
-            let d_output = grad_output.tr().mm(&self.z);
+            let d_interface = dxi.tr().mm(&self.z.after().narrow(1, 0, dnc.hidden));
+            let d_output = grad_output.tr().mm(&self.z.after());
             let biases = [sum(da), sum(da), sum(dxi), sum(&grad_output)];
             let grad_input = da.mm(&dnc.weight_input.narrow(1, 0, inputs));
             ([d_input, d_state, d_interface, d_output].into_iter().chain(biases).collect::<Vec<_>>(), grad_input)
@@ -218,27 +192,16 @@ impl Tape {
         grad_input
     }
 
-    /// Controller's output and read vectors before each step.
-    fn z_before(&self) -> Tensor {
-        let rows = self.steps.windows(2).flat_map(|pair| (pair[0].start..).take(pair[1].len()));
-        let rows: Vec<i64> = rows.map(|row| row as i64).collect();
-        Tensor::cat(&[&self.z_initial, &self.z.index_select(0, &Tensor::from_slice(&rows))], 0)
-    }
-
     /// Turns `a` and `xi` into their gradients. `dz` holds what comes through the output alone.
     fn backward_steps(&mut self, dnc: &Dnc, dz: &Tensor, recurrent: &Tensor) {
-        let (s, hidden, sequences) = (dnc.sizes(), dnc.hidden as usize, self.steps[0].len());
+        let (s, hidden, sequences) = (dnc.sizes(), dnc.hidden as usize, self.steps[0].now.len());
         let mut scratch = dnc_backward::Scratch::new(s);
         let mut dc = vec![0.0; sequences * hidden];
         let mut gradients = s.fields().map(|width| vec![0.0; sequences * width]);
-        for (t, now) in self.steps.iter().enumerate().rev() {
-            let previous = if t > 0 { self.steps[t - 1].clone() } else { 0..0 };
+        for step in self.steps.iter().rev() {
+            let now = &step.now;
             let [mut a, mut xi, dz_now] = [&self.a, &self.xi, dz].map(|x| narrow(x, now));
-            let (mut initial, mut widths) = (fields(&self.initial).into_iter(), s.fields().into_iter());
-            let pairs = self.fields.each_mut().map(|field| {
-                let (initial, width) = initial.next().zip(widths.next()).expect("one for each field");
-                at(field, initial, &previous, now, width)
-            });
+            let pairs = self.fields.each_mut().map(|field| field.slices(step));
             let rows = dnc_backward::Rows {
                 before: pairs.each_ref().map(|(before, _)| *before),
                 after: pairs.map(|(_, after)| &*after),
@@ -249,26 +212,13 @@ impl Tape {
             };
             dnc_backward::step(s, rows, &mut scratch);
             let _ = dz_now.narrow(1, 0, dnc.hidden).addmm_(&xi, &dnc.weight_interface);
-            let (c_before, c) = at(&mut self.c, floats(&self.initial[1]), &previous, now, hidden);
+            let (c_before, c) = self.c.slices(step);
             lstm_backward(floats_mut(&mut a), c_before, c, floats(&dz_now), &mut dc[..now.len() * hidden], hidden);
-            if t > 0 {
-                let _ = narrow(dz, &(previous.start..previous.start + now.len())).addmm_(&a, recurrent);
+            if let Some(before) = self.z.rows_before(step) {
+                let _ = narrow(dz, &before).addmm_(&a, recurrent);
             }
         }
     }
-}
-
-/// The numbers of a time step's rows before (those of the step before, or the initial ones) and after.
-fn at<'a>(
-    numbers: &'a mut [f32],
-    initial: &'a [f32],
-    previous: &Range<usize>,
-    now: &Range<usize>,
-    width: usize,
-) -> (&'a [f32], &'a mut [f32]) {
-    let (past, rest) = numbers.split_at_mut(now.start * width);
-    let before = if previous.is_empty() { initial } else { &past[previous.start * width..] };
-    (&before[..now.len() * width], &mut rest[..now.len() * width])
 }
 
 widest! {

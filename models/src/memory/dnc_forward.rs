@@ -54,12 +54,7 @@ impl Scratch {
 
 widest! {
     /// One time step of some rows.
-    fn wide(s: Sizes, rows: Rows<'_>, scratch: &mut Scratch) = of_any_size
-}
-
-/// One time step of some rows.
-pub(super) fn step(s: Sizes, rows: Rows<'_>, scratch: &mut Scratch) {
-    wide(s, rows, scratch);
+    pub(super) fn step(s: Sizes, rows: Rows<'_>, scratch: &mut Scratch) = of_any_size
 }
 
 #[inline(always)]

@@ -17,8 +17,8 @@ pub(super) fn floats(tensor: &Tensor) -> &[f32] {
         return &[];
     }
     // SAFETY: `check` made sure that `numel` f32 numbers lie at `data_ptr`; they live as long as the tensor does. Tensors
-    // may share numbers; the loops over time, the only callers, hold slices of disjoint rows, and only between libtorch's
-    // calls.
+    // may share numbers: the callers, all in this directory, see to it that no slice to be written overlaps another slice
+    // that is in use, in any thread, and call no function of libtorch that writes to these numbers while they hold one.
     unsafe { std::slice::from_raw_parts(tensor.data_ptr().cast(), tensor.numel()) }
 }
 
@@ -45,10 +45,10 @@ fn check(tensor: &Tensor) {
 /// Defines a function that runs `$body`, an `#[inline(always)]` function, compiled for the widest vectors that the machine
 /// has.
 macro_rules! widest {
-    ($(#[$attribute:meta])* fn $name:ident $(<$generic:ident: $bound:ident>)? ($($argument:ident: $kind:ty),* $(,)?) = $body:path) => {
+    ($(#[$attribute:meta])* $visibility:vis fn $name:ident $(<$generic:ident: $bound:ident>)? ($($argument:ident: $kind:ty),* $(,)?) = $body:path) => {
         $(#[$attribute])*
         #[allow(unsafe_code)]
-        fn $name $(<$generic: $bound>)? ($($argument: $kind),*) {
+        $visibility fn $name $(<$generic: $bound>)? ($($argument: $kind),*) {
             #[cfg(target_arch = "x86_64")]
             {
                 #[target_feature(enable = "avx512f")]

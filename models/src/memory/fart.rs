@@ -38,9 +38,9 @@ pub struct Fart {
 #[derive(Clone, Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct FartOptions {
-    /// Width of the output; the paper's is 256.
+    /// Width of the output, 1 to 4,096; the paper's is 256.
     pub hidden_size: i64,
-    /// Width of keys, queries and values, whose square is the size of the state; POPGym's is 15 (16 in the paper).
+    /// Width of keys, queries and values, whose square is the size of the state, 1 to 512; POPGym's is 15 (16 in the paper).
     pub key_size: i64,
 }
 
@@ -57,8 +57,8 @@ impl MemoryKind for Fart {
     type Options = FartOptions;
 
     fn new(path: &Path<'_>, input_width: i64, options: &FartOptions) -> Result<Self, String> {
-        let hidden_size = super::check_size("hidden_size", options.hidden_size)?;
-        let key_size = super::check_size("key_size", options.key_size)?;
+        let hidden_size = super::check_hidden_size(options.hidden_size)?;
+        let key_size = super::check_size("key_size", options.key_size, 512)?;
         Ok(Self { hidden_size, key_size, layers: Layers::new(path, input_width, key_size, hidden_size) })
     }
 }

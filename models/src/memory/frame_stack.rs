@@ -34,7 +34,7 @@ pub struct FrameStack {
 #[derive(Clone, Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct FrameStackOptions {
-    /// Width of the output; the paper's is 256. A frame gets `hidden_size / stack_size` numbers, rounded up.
+    /// Width of the output, 1 to 4,096; the paper's is 256. A frame gets `hidden_size / stack_size` numbers, rounded up.
     pub hidden_size: i64,
     /// Number of inputs seen at once, the present one included: 2 to 1,024; the paper's is 4.
     pub stack_size: i64,
@@ -53,7 +53,7 @@ impl MemoryKind for FrameStack {
     type Options = FrameStackOptions;
 
     fn new(path: &Path<'_>, input_width: i64, options: &FrameStackOptions) -> Result<Self, String> {
-        let hidden_size = super::check_size("hidden_size", options.hidden_size)?;
+        let hidden_size = super::check_hidden_size(options.hidden_size)?;
         let stack_size = windows::check_window("stack_size", options.stack_size)?;
         let frame_width = (hidden_size + stack_size - 1) / stack_size;
         let stack_width = frame_width * stack_size;
@@ -71,7 +71,7 @@ impl MemoryKind for FrameStack {
 impl FrameStack {
     /// `[rows, stack width]` to the output.
     fn layers(&self, frames: &Tensor) -> Tensor {
-        leaky_relu(&self.second.forward(&leaky_relu(&self.first.forward(frames))))
+        leaky_relu(self.second.forward(&leaky_relu(self.first.forward(frames))))
     }
 }
 

@@ -36,9 +36,9 @@ pub struct Fwp {
 #[derive(Clone, Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct FwpOptions {
-    /// Width of the output; the paper's is 256.
+    /// Width of the output, 1 to 4,096; the paper's is 256.
     pub hidden_size: i64,
-    /// Width of keys, queries and values, whose square is the size of the state; the paper's is 16.
+    /// Width of keys, queries and values, whose square is the size of the state, 1 to 512; the paper's is 16.
     pub key_size: i64,
 }
 
@@ -55,8 +55,8 @@ impl MemoryKind for Fwp {
     type Options = FwpOptions;
 
     fn new(path: &Path<'_>, input_width: i64, options: &FwpOptions) -> Result<Self, String> {
-        let hidden_size = super::check_size("hidden_size", options.hidden_size)?;
-        let key_size = super::check_size("key_size", options.key_size)?;
+        let hidden_size = super::check_hidden_size(options.hidden_size)?;
+        let key_size = super::check_size("key_size", options.key_size, 512)?;
         Ok(Self { hidden_size, key_size, layers: Layers::new(path, input_width, key_size, hidden_size) })
     }
 }

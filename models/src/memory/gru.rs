@@ -15,21 +15,15 @@
 use tch::nn::Path;
 use tch::{Device, Kind, Tensor};
 
+use super::cell_weights::CellWeights;
 use super::elementwise::on_cpu;
 use super::gru_cpu::GruCell;
 use super::{HiddenSize, Memory, MemoryKind, Scan, State, recurrent_cpu};
-use crate::init::uniform;
 use crate::packing::Packing;
 
 /// One GRU layer.
 #[derive(Debug)]
-pub struct Gru {
-    hidden_size: i64,
-    weight_input: Tensor,
-    weight_state: Tensor,
-    bias_input: Tensor,
-    bias_state: Tensor,
-}
+pub struct Gru(CellWeights);
 
 impl MemoryKind for Gru {
     const NAME: &'static str = "gru";
@@ -38,36 +32,21 @@ impl MemoryKind for Gru {
     type Options = HiddenSize;
 
     fn new(path: &Path<'_>, input_width: i64, options: &HiddenSize) -> Result<Self, String> {
-        let hidden_size = super::check_size("hidden_size", options.hidden_size)?;
-        let init = uniform(hidden_size);
-        let gates = 3 * hidden_size;
-        Ok(Self {
-            hidden_size,
-            weight_input: path.var("weight_input", &[gates, input_width], init),
-            weight_state: path.var("weight_state", &[gates, hidden_size], init),
-            bias_input: path.var("bias_input", &[gates], init),
-            bias_state: path.var("bias_state", &[gates], init),
-        })
-    }
-}
-
-impl Gru {
-    fn parameters(&self) -> [&Tensor; 4] {
-        [&self.weight_input, &self.weight_state, &self.bias_input, &self.bias_state]
+        Ok(Self(CellWeights::new(path, 3, input_width, options)?))
     }
 }
 
 impl Memory for Gru {
     fn output_width(&self) -> i64 {
-        self.hidden_size
+        self.0.hidden_size
     }
 
     fn initial_state(&self, rows: i64, device: Device) -> State {
-        State(vec![Tensor::zeros([rows, self.hidden_size], (Kind::Float, device))])
+        State(vec![Tensor::zeros([rows, self.0.hidden_size], (Kind::Float, device))])
     }
 
     fn step(&self, input: &Tensor, state: &State) -> (Tensor, State) {
-        let [weight_input, weight_state, bias_input, bias_state] = self.parameters();
+        let [weight_input, weight_state, bias_input, bias_state] = self.0.all();
         let next = input.gru_cell(&state.0[0], weight_input, weight_state, Some(bias_input), Some(bias_state));
         (next.shallow_clone(), State(vec![next]))
     }
@@ -76,16 +55,15 @@ impl Memory for Gru {
         if !on_cpu(input) {
             return tch::no_grad(|| self.step(input, state));
         }
-        recurrent_cpu::step::<GruCell>(self.parameters(), input, state)
+        recurrent_cpu::step::<GruCell>(self.0.all(), input, state)
     }
 
     fn scan(&self, input: &Tensor, packing: &Packing, state: &State) -> Scan {
         if on_cpu(input) {
-            return recurrent_cpu::scan::<GruCell>(self.parameters(), input, packing, state);
+            return recurrent_cpu::scan::<GruCell>(self.0.all(), input, packing, state);
         }
         let (batch_sizes, initial) = (packing.batch_sizes_tensor(), state.0[0].unsqueeze(0));
-        let (output, last) =
-            Tensor::gru_data(input, &batch_sizes, &initial, &self.parameters(), true, 1, 0.0, true, false);
+        let (output, last) = Tensor::gru_data(input, &batch_sizes, &initial, &self.0.all(), true, 1, 0.0, true, false);
         Scan { output, state: State(vec![last.squeeze_dim(0)]), computed_steps: packing.rows(), backward: None }
     }
 }

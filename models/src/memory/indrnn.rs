@@ -11,9 +11,9 @@
 //! `first_bias_state` and `second_bias_state`. W and b start uniform within `+-1/sqrt(fan-in)`, u and c uniform within 0 and
 //! 1 (the biases c too, as upstream). State: `a` and `e`, `[rows, hidden]` each.
 //!
-//! u0 and u1 act as if clamped to `+-2^(1/1024)`, so that 1024 steps at most double a state. Upstream clamps the parameters
-//! themselves before each forward; here the clamp is part of the function, which is the same function, but the parameter
-//! is left alone and gets no gradient beyond the bounds. Upstream ignores its option `activation` (it says tanh, ReLU is
+//! u0 and u1 are clamped to `+-2^(1/1024)`, so that 1024 steps at most double a state: the parameters themselves after
+//! each optimiser's step (upstream: before each forward), so that one at a bound is free to come back, and their use in
+//! the function, for weights from elsewhere. Upstream ignores its option `activation` (it says tanh, ReLU is
 //! built in; so it is here) and has an output layer that it never uses, which is left out.
 //!
 //! On the CPU a scan is two matrix products and two loops over time without any (`indrnn_cpu.rs`).
@@ -28,6 +28,11 @@ use crate::packing::Packing;
 
 /// The paper's U(0, 1).
 const UP_TO_ONE: Init = Init::Uniform { lo: 0.0, up: 1.0 };
+
+/// Of the recurrent weights' absolute values.
+fn bound() -> f64 {
+    2_f64.powf(1.0 / 1024.0)
+}
 
 /// Two layers of independent units.
 #[derive(Debug)]
@@ -59,8 +64,13 @@ impl Layer {
 
     /// The recurrent weights as they act.
     pub(super) fn clamped(&self) -> Tensor {
-        let bound = 2_f64.powf(1.0 / 1024.0);
-        self.recurrent.clamp(-bound, bound)
+        self.recurrent.clamp(-bound(), bound())
+    }
+
+    fn constrain(&self) {
+        tch::no_grad(|| {
+            let _ = self.recurrent.shallow_clone().clamp_(-bound(), bound());
+        });
     }
 
     fn step(&self, input: &Tensor, state: &Tensor) -> Tensor {
@@ -75,7 +85,7 @@ impl MemoryKind for IndRnn {
     type Options = HiddenSize;
 
     fn new(path: &Path<'_>, input_width: i64, options: &HiddenSize) -> Result<Self, String> {
-        let hidden_size = super::check_size("hidden_size", options.hidden_size)?;
+        let hidden_size = super::check_hidden_size(options.hidden_size)?;
         Ok(Self {
             hidden_size,
             first: Layer::new(path, "first", "weight_input", [hidden_size, input_width]),
@@ -113,5 +123,10 @@ impl Memory for IndRnn {
             return scan_by_steps(self, input, packing, state);
         }
         indrnn_cpu::scan([&self.first, &self.second], input, packing, state)
+    }
+
+    fn constrain(&self) {
+        self.first.constrain();
+        self.second.constrain();
     }
 }

@@ -19,7 +19,7 @@ use tch::nn::{Init, Path};
 use tch::{Device, Kind, Tensor};
 
 use super::elementwise::on_cpu;
-use super::{Memory, MemoryKind, Scan, State, check_size, lmu_cpu, scan_by_steps};
+use super::{Memory, MemoryKind, Scan, State, check_hidden_size, check_size, lmu_cpu, scan_by_steps};
 use crate::packing::Packing;
 
 /// Largest order of the memory; the discretisation's time and memory grow with its cube and square.
@@ -31,7 +31,7 @@ const MAX_THETA: f64 = 65_536.0;
 #[derive(Clone, Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct LmuOptions {
-    /// Width of h and of the output, 1 to 65,536; the paper's is 256.
+    /// Width of h and of the output, 1 to 4,096; the paper's is 256.
     pub hidden_size: i64,
     /// Length of the window that the memory holds, in time steps, 1 to 65,536; the paper's is 64.
     pub theta: f64,
@@ -121,11 +121,9 @@ impl MemoryKind for Lmu {
     type Options = LmuOptions;
 
     fn new(path: &Path<'_>, input_width: i64, options: &LmuOptions) -> Result<Self, String> {
-        let hidden_size = check_size("hidden_size", options.hidden_size)?;
-        let &LmuOptions { theta, memory_size, .. } = options;
-        if !(1..=MAX_ORDER).contains(&memory_size) {
-            return Err(format!("`memory_size` is {memory_size}, allowed is 1..={MAX_ORDER}"));
-        }
+        let hidden_size = check_hidden_size(options.hidden_size)?;
+        let memory_size = check_size("memory_size", options.memory_size, MAX_ORDER)?;
+        let theta = options.theta;
         if !(1.0..=MAX_THETA).contains(&theta) {
             return Err(format!("`theta` is {theta}, allowed is 1..={MAX_THETA}"));
         }

@@ -16,21 +16,15 @@
 use tch::nn::Path;
 use tch::{Device, Kind, Tensor};
 
+use super::cell_weights::CellWeights;
 use super::elementwise::on_cpu;
 use super::lstm_cpu::LstmCell;
 use super::{HiddenSize, Memory, MemoryKind, Scan, State, recurrent_cpu};
-use crate::init::uniform;
 use crate::packing::Packing;
 
 /// One LSTM layer.
 #[derive(Debug)]
-pub struct Lstm {
-    hidden_size: i64,
-    weight_input: Tensor,
-    weight_state: Tensor,
-    bias_input: Tensor,
-    bias_state: Tensor,
-}
+pub struct Lstm(CellWeights);
 
 impl MemoryKind for Lstm {
     const NAME: &'static str = "lstm";
@@ -39,37 +33,22 @@ impl MemoryKind for Lstm {
     type Options = HiddenSize;
 
     fn new(path: &Path<'_>, input_width: i64, options: &HiddenSize) -> Result<Self, String> {
-        let hidden_size = super::check_size("hidden_size", options.hidden_size)?;
-        let init = uniform(hidden_size);
-        let gates = 4 * hidden_size;
-        Ok(Self {
-            hidden_size,
-            weight_input: path.var("weight_input", &[gates, input_width], init),
-            weight_state: path.var("weight_state", &[gates, hidden_size], init),
-            bias_input: path.var("bias_input", &[gates], init),
-            bias_state: path.var("bias_state", &[gates], init),
-        })
-    }
-}
-
-impl Lstm {
-    fn parameters(&self) -> [&Tensor; 4] {
-        [&self.weight_input, &self.weight_state, &self.bias_input, &self.bias_state]
+        Ok(Self(CellWeights::new(path, 4, input_width, options)?))
     }
 }
 
 impl Memory for Lstm {
     fn output_width(&self) -> i64 {
-        self.hidden_size
+        self.0.hidden_size
     }
 
     fn initial_state(&self, rows: i64, device: Device) -> State {
-        let zeros = || Tensor::zeros([rows, self.hidden_size], (Kind::Float, device));
+        let zeros = || Tensor::zeros([rows, self.0.hidden_size], (Kind::Float, device));
         State(vec![zeros(), zeros()])
     }
 
     fn step(&self, input: &Tensor, state: &State) -> (Tensor, State) {
-        let [weight_input, weight_state, bias_input, bias_state] = self.parameters();
+        let [weight_input, weight_state, bias_input, bias_state] = self.0.all();
         let (h, c) = input.lstm_cell(
             &[&state.0[0], &state.0[1]],
             weight_input,
@@ -84,19 +63,19 @@ impl Memory for Lstm {
         if !on_cpu(input) {
             return tch::no_grad(|| self.step(input, state));
         }
-        recurrent_cpu::step::<LstmCell>(self.parameters(), input, state)
+        recurrent_cpu::step::<LstmCell>(self.0.all(), input, state)
     }
 
     fn scan(&self, input: &Tensor, packing: &Packing, state: &State) -> Scan {
         if on_cpu(input) {
-            return recurrent_cpu::scan::<LstmCell>(self.parameters(), input, packing, state);
+            return recurrent_cpu::scan::<LstmCell>(self.0.all(), input, packing, state);
         }
         let initial = [state.0[0].unsqueeze(0), state.0[1].unsqueeze(0)];
         let (output, h, c) = Tensor::lstm_data(
             input,
             &packing.batch_sizes_tensor(),
             &initial.each_ref(),
-            &self.parameters(),
+            &self.0.all(),
             true,
             1,
             0.0,

@@ -24,7 +24,7 @@ impl MemoryKind for Mlp {
     type Options = HiddenSize;
 
     fn new(path: &Path<'_>, input_width: i64, options: &HiddenSize) -> Result<Self, String> {
-        let hidden_size = super::check_size("hidden_size", options.hidden_size)?;
+        let hidden_size = super::check_hidden_size(options.hidden_size)?;
         Ok(Self {
             hidden_size,
             first: Linear::new(&(path / "first"), input_width, hidden_size, uniform(input_width)),
@@ -43,8 +43,8 @@ impl Memory for Mlp {
     }
 
     fn step(&self, input: &Tensor, _state: &State) -> (Tensor, State) {
-        let hidden = leaky_relu(&self.first.forward(input));
-        (leaky_relu(&self.second.forward(&hidden)), State::default())
+        let hidden = leaky_relu(self.first.forward(input));
+        (leaky_relu(self.second.forward(&hidden)), State::default())
     }
 
     fn scan(&self, input: &Tensor, packing: &Packing, state: &State) -> Scan {

@@ -4,9 +4,10 @@
 //! - [`Memory::act`]: the same without gradients, as fast as the CPU can; what actors run;
 //! - [`Memory::scan`]: whole packed sequences, in the most parallel form the mathematics allows; what the learner runs.
 //!
-//! They agree within `1e-5 max(1, largest |output|)`. Only `step` must be written; the others follow from it, slowly. To
-//! add a memory, copy `elman.rs` and add one line to [`Registry::standard`]; the tests of this crate then run on it
-//! without being told.
+//! They agree within `1e-5 max(1, largest |output|)`. Only `step` must be written; the others follow from it, slowly, as
+//! in `tests/examples/custom/src/decay.rs`, a memory of a user's own. One of this crate also needs its `mod` line here, a
+//! line in [`Registry::standard`], and a row in the table of sizes in `tests/memory.rs`; all other tests of this crate then
+//! run on it without being told.
 
 use std::sync::Arc;
 
@@ -18,6 +19,7 @@ use tch::{Device, Tensor};
 use crate::ModelError;
 use crate::packing::Packing;
 
+mod cell_weights;
 mod dnc;
 mod dnc_backward;
 mod dnc_cells;
@@ -140,9 +142,14 @@ pub trait Memory: Send {
     }
 
     /// Whole sequences: packed `input [rows, input width]`; `state` before their first step, in packed order.
+    ///
+    /// Gradients, those of the parameters too, are to be had only if `input` requires them. None flow into `state`.
     fn scan(&self, input: &Tensor, packing: &Packing, state: &State) -> Scan {
         scan_by_steps(self, input, packing, state)
     }
+
+    /// Puts parameters back where they are allowed to be: called after every optimiser's step.
+    fn constrain(&self) {}
 }
 
 /// [`Memory::scan`] as a loop over [`Memory::step`], with autograd's gradients.
@@ -174,7 +181,7 @@ pub fn scan_by_steps<M: Memory + ?Sized>(memory: &M, input: &Tensor, packing: &P
 #[derive(Clone, Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct HiddenSize {
-    /// Width of the state, where there is one, and of the output; the paper's is 256.
+    /// Width of the state, where there is one, and of the output, 1 to 4,096; the paper's is 256.
     pub hidden_size: i64,
 }
 
@@ -319,10 +326,9 @@ impl Registry {
     /// An unknown name, with the nearest known one.
     pub fn get(&self, name: &str) -> Result<&Entry, ModelError> {
         self.entries.iter().find(|entry| entry.name == name).ok_or_else(|| {
-            let nearest = self
-                .entries
-                .iter()
-                .max_by(|a, b| strsim::jaro_winkler(a.name, name).total_cmp(&strsim::jaro_winkler(b.name, name)));
+            let wanted = name.to_lowercase();
+            let likeness = |entry: &Entry| strsim::jaro_winkler(&entry.name.to_lowercase(), &wanted);
+            let nearest = self.entries.iter().max_by(|a, b| likeness(a).total_cmp(&likeness(b)));
             ModelError::UnknownMemory {
                 name: name.to_owned(),
                 nearest: nearest.map_or_else(String::new, |entry| entry.name.to_owned()),
@@ -346,7 +352,12 @@ fn add_gradients(parameters: &[&Tensor], gradients: &[Tensor]) {
     }
 }
 
-/// A width or size option: 1 to 65,536.
-fn check_size(key: &str, value: i64) -> Result<i64, String> {
-    if (1..=65_536).contains(&value) { Ok(value) } else { Err(format!("`{key}` is {value}, allowed is 1..=65536")) }
+/// An option `key` that must be 1 to `most`.
+fn check_size(key: &str, value: i64, most: i64) -> Result<i64, String> {
+    if (1..=most).contains(&value) { Ok(value) } else { Err(format!("`{key}` is {value}, allowed is 1..={most}")) }
+}
+
+/// The option `hidden_size`: layers are as large as its square.
+fn check_hidden_size(value: i64) -> Result<i64, String> {
+    check_size("hidden_size", value, 4096)
 }

@@ -59,7 +59,7 @@ pub struct S4d {
 #[derive(Clone, Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct S4dOptions {
-    /// Number of channels and width of the output; the paper's is 256.
+    /// Number of channels and width of the output, 1 to 4,096; the paper's is 256.
     pub hidden_size: i64,
     /// Numbers of a channel's state: even, each two are one complex mode; the paper's is 16.
     pub state_size: i64,
@@ -78,7 +78,7 @@ impl MemoryKind for S4d {
     type Options = S4dOptions;
 
     fn new(path: &Path<'_>, input_width: i64, options: &S4dOptions) -> Result<Self, String> {
-        let hidden_size = super::check_size("hidden_size", options.hidden_size)?;
+        let hidden_size = super::check_hidden_size(options.hidden_size)?;
         let state_size = options.state_size;
         if !(2..=1024).contains(&state_size) || state_size % 2 != 0 {
             return Err(format!("`state_size` is {state_size}, allowed is an even number of 2..=1024"));

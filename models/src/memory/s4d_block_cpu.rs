@@ -74,16 +74,6 @@ impl<'a> System<'a> {
     }
 }
 
-/// A block's forward.
-pub(super) fn forward(block: Forward<'_>) {
-    advance_block(block);
-}
-
-/// A block's backward.
-pub(super) fn backward(block: Reverse<'_>) {
-    reverse_block(block);
-}
-
 /// What a block's forward reads and writes.
 pub(super) struct Forward<'a> {
     pub(super) stretches: &'a [Stretch],
@@ -99,7 +89,7 @@ pub(super) struct Forward<'a> {
 
 widest! {
     /// Advances a block's states by all steps.
-    fn advance_block(block: Forward<'_>) = forward_block
+    pub(super) fn forward(block: Forward<'_>) = forward_block
 }
 
 #[inline(always)]
@@ -168,7 +158,7 @@ pub(super) struct Reverse<'a> {
 
 widest! {
     /// A block's gradients.
-    fn reverse_block(block: Reverse<'_>) = backward_block
+    pub(super) fn backward(block: Reverse<'_>) = backward_block
 }
 
 #[inline(always)]
@@ -247,8 +237,7 @@ fn backward_mode(
 mod tests {
     use super::super::elementwise::numbers;
     use super::{
-        Columns, Forward, LANES, Lanes, Reverse, Stretch, System, advance_block, backward_block, forward_block,
-        reverse_block,
+        Columns, Forward, LANES, Lanes, Reverse, Stretch, System, backward, backward_block, forward, forward_block,
     };
 
     fn lanes(count: usize, seed: usize) -> Vec<Lanes> {
@@ -271,10 +260,10 @@ mod tests {
                 let (mut before, mut grad_system) = (lanes(6 * modes, 6), lanes(6 * modes + 1, 7));
                 let (stretches, system) = (&stretches, System::new(&system));
                 let work = Forward { stretches, u, system, state: &mut state, v: &mut v, before: &mut before };
-                (if wide { advance_block } else { forward_block })(work);
+                (if wide { forward } else { forward_block })(work);
                 let (grad, before) = (&mut grad_system, &before);
                 let work = Reverse { stretches, u, dv, system, before, grad_system: grad, du: &mut du };
-                (if wide { reverse_block } else { backward_block })(work);
+                (if wide { backward } else { backward_block })(work);
                 [state, v, du, grad_system].map(|x| x.as_flattened().iter().map(|x| x.to_bits()).collect::<Vec<_>>())
             };
             assert_eq!(run(true), run(false), "hidden {hidden}, modes {modes}");

@@ -32,7 +32,7 @@ pub struct Tcn {
 #[derive(Clone, Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct TcnOptions {
-    /// Width of the output; the paper's is 256.
+    /// Width of the output, 1 to 4,096; the paper's is 256.
     pub hidden_size: i64,
     /// Number of inputs seen at once, the present one included: 2 to 1,024; the paper's is 4.
     pub window: i64,
@@ -51,7 +51,7 @@ impl MemoryKind for Tcn {
     type Options = TcnOptions;
 
     fn new(path: &Path<'_>, input_width: i64, options: &TcnOptions) -> Result<Self, String> {
-        let hidden_size = super::check_size("hidden_size", options.hidden_size)?;
+        let hidden_size = super::check_hidden_size(options.hidden_size)?;
         let window = windows::check_window("window", options.window)?;
         let init = uniform(input_width * window);
         Ok(Self {

@@ -77,7 +77,11 @@ impl Windows {
             sizes.push(left);
         }
         let parts = rows.split_with_sizes(&sizes, 0);
-        Tensor::cat(&taken.iter().map(|&run| &parts[run as usize]).collect::<Vec<_>>(), 0)
+        match taken[..] {
+            // Sequences of equal length: nothing to copy.
+            [run] => parts[run as usize].shallow_clone(),
+            _ => Tensor::cat(&taken.iter().map(|&run| &parts[run as usize]).collect::<Vec<_>>(), 0),
+        }
     }
 
     /// The state after each sequence's last step.
