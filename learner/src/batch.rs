@@ -236,7 +236,7 @@ fn chunks_by_steps(lengths: &[i64], budget: i64) -> Vec<std::ops::Range<usize>> 
 }
 
 #[cfg(test)]
-mod tests {
+pub(crate) mod tests {
     use bytes::Bytes;
     use popgym_envs::space::{Space, Value};
     use popgym_models::{Policy, PolicyOptions, PolicySpec, memory};
@@ -246,12 +246,13 @@ mod tests {
     use super::{Batch, chunks_by_steps, to_vec};
     use crate::config::Ppo;
 
-    fn policy() -> Policy {
+    /// For episodes of 3 observations and 2 actions.
+    pub(crate) fn policy(memory: &str, memory_options: &str) -> Policy {
         let spec = PolicySpec {
             observation: Space::Discrete(3),
             action: Space::Discrete(2),
-            memory: "gru".to_owned(),
-            memory_options: toml::Table::from_iter([("hidden_size".to_owned(), toml::Value::Integer(8))]),
+            memory: memory.to_owned(),
+            memory_options: memory_options.parse().unwrap(),
             options: PolicyOptions { log_std_min: f64::NEG_INFINITY, log_std_max: f64::INFINITY },
             max_steps: 10,
         };
@@ -259,7 +260,8 @@ mod tests {
         Policy::new(&spec, &memory::Registry::standard(), Device::Cpu).unwrap()
     }
 
-    fn episode(index: u64, observations: &[u8], actions: &[u8], terminated: bool) -> Episode {
+    /// Its rewards are 1, 2, 3...
+    pub(crate) fn episode(index: u64, observations: &[u8], actions: &[u8], terminated: bool) -> Episode {
         let columns = |classes: &[u8]| Columns { discrete: Bytes::copy_from_slice(classes), real: Vec::new() };
         Episode {
             index,
@@ -295,7 +297,7 @@ mod tests {
 
     #[test]
     fn the_packed_pass_finds_what_single_steps_find() {
-        let policy = policy();
+        let policy = policy("gru", "hidden_size = 8");
         let episodes = [
             episode(0, &[0, 1, 2], &[1, 0], true),
             episode(1, &[2, 2, 1, 0, 1], &[0, 1, 1, 0], false),

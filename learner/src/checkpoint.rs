@@ -18,6 +18,7 @@ use sha2::{Digest, Sha256};
 use tch::{Kind, Tensor};
 
 use crate::adam::AdamState;
+use crate::fail_point;
 
 const FORMAT: u32 = 1;
 const MANIFEST: &str = "manifest.json";
@@ -87,9 +88,11 @@ impl Checkpoint {
         fs::create_dir_all(&temporary).with_context(|| format!("cannot create {}", temporary.display()))?;
         let mut files = BTreeMap::new();
         for (name, bytes) in self.files() {
+            fail_point::reached("a checkpoint without all its files");
             write_synced(&temporary.join(name), &bytes)?;
             files.insert(name.to_owned(), hex_digest(&bytes));
         }
+        fail_point::reached("a checkpoint without its manifest");
         let manifest = Manifest {
             format: FORMAT,
             about: about.clone(),
@@ -99,8 +102,10 @@ impl Checkpoint {
         };
         write_synced(&temporary.join(MANIFEST), &serde_json::to_vec_pretty(&manifest)?)?;
         sync_dir(&temporary)?;
+        fail_point::reached("a checkpoint under its temporary name");
         remove_dir_if_there(&path)?;
         fs::rename(&temporary, &path).with_context(|| format!("cannot rename {}", temporary.display()))?;
+        fail_point::reached("a checkpoint whose name is not yet synced");
         sync_dir(dir)?;
         Ok(path)
     }
@@ -223,6 +228,9 @@ pub fn prune(dir: &Path, keep: usize) -> anyhow::Result<()> {
     let best = best(dir)?;
     let old = paths.len().saturating_sub(keep);
     for path in paths.into_iter().take(old).filter(|path| Some(path) != best.as_ref()) {
+        fail_point::reached_with("a checkpoint half removed", || {
+            let _ = fs::remove_file(path.join(WEIGHTS));
+        });
         fs::remove_dir_all(&path).with_context(|| format!("cannot remove {}", path.display()))?;
     }
     Ok(())

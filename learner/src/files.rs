@@ -6,6 +6,8 @@ use std::path::{Path, PathBuf};
 
 use anyhow::Context as _;
 
+use crate::fail_point;
+
 /// Writes a file under a temporary name beside `path` by `write`, then renames it to `path`: readers see the old file
 /// or the new one, whole. The temporary name keeps the extension.
 pub(crate) fn replace(path: &Path, write: impl FnOnce(&Path) -> anyhow::Result<()>) -> anyhow::Result<()> {
@@ -80,6 +82,9 @@ impl AppendFile {
     /// Appends a record, after those that an earlier call could not write.
     pub(crate) fn append(&mut self, record: &[u8]) -> anyhow::Result<()> {
         self.pending.extend_from_slice(record);
+        fail_point::reached_with("a record half written", || {
+            let _ = self.file.write_all(&self.pending[..self.pending.len() / 2]);
+        });
         if let Err(error) = self.file.write_all(&self.pending) {
             let _ = self.file.set_len(self.len);
             return Err(error).with_context(|| format!("cannot write {}", self.path.display()));
@@ -91,6 +96,7 @@ impl AppendFile {
 
     /// Waits until all that was appended is on the disk.
     pub(crate) fn sync(&self) -> anyhow::Result<()> {
+        fail_point::reached("a record not yet synced");
         self.file.sync_data().with_context(|| format!("cannot sync {}", self.path.display()))
     }
 }

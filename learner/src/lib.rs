@@ -12,6 +12,7 @@
 //! | [`study`] | many runs: environments x memories x seeds |
 //! | [`report`] | tables, figures and a page of many runs, beside the paper's |
 //! | `chart` | what all charts share |
+//! | `fail_point` | where tests have the learner die |
 //! | [`statistics`] | means, quantiles, intervals, rank correlation |
 //! | `screen` | environments on a terminal and as animated images: what `play` and `watch` show |
 //! | [`baseline`], [`space_text`] | what acting at random scores; spaces in words |
@@ -27,6 +28,7 @@ mod chart;
 pub mod checkpoint;
 pub mod commands;
 pub mod config;
+mod fail_point;
 mod files;
 pub mod gae;
 pub mod interrupt;

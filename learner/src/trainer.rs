@@ -18,6 +18,7 @@ use crate::adam::{Adam, AdamOptions, AdamState};
 use crate::batch::Batch;
 use crate::checkpoint::{self, Checkpoint, Progress};
 use crate::config::{Config, LearningRateSchedule};
+use crate::fail_point;
 use crate::interrupt::Interrupt;
 use crate::local_actors::Hopeless;
 use crate::observer::{EpochMetrics, EpochReport, EpochTiming, Observer, Summary};
@@ -228,6 +229,7 @@ impl Trainer<'_> {
         };
         let report = EpochReport { metrics, timing };
         self.tell(|observer| observer.epoch(&report));
+        fail_point::reached("an epoch reported and not saved");
         if state.progress.epoch.is_multiple_of(self.config.checkpoint_epochs) {
             let _ = self.save(state);
         }

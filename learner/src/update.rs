@@ -222,8 +222,79 @@ mod tests {
     use popgym_models::distribution::Evaluation;
     use tch::Tensor;
 
-    use super::{Minibatch, next_kl_coef};
+    use popgym_envs::space::Space;
+    use popgym_envs::{Purpose, stream};
+
+    use super::{Minibatch, Schedule, UpdateMeans, next_kl_coef, update};
+    use crate::adam::{Adam, AdamOptions};
+    use crate::batch::{Batch, tests};
     use crate::config::Ppo;
+    use crate::minibatches::Minibatches;
+
+    /// One epoch's losses at learning rate 0: 60 episodes of 1 to 12 steps, shifted by `first`, sampled with weights that are not the
+    /// policy's.
+    fn losses_at_rest(
+        memory: &str,
+        first: usize,
+        minibatch_steps: i64,
+        minibatches: Minibatches,
+        seed: u64,
+    ) -> UpdateMeans {
+        let (policy, behaviour) = (tests::policy(memory, ""), tests::policy(memory, ""));
+        tch::no_grad(|| {
+            for weights in behaviour.parameters().values() {
+                let _ = weights.shallow_clone().g_mul_scalar_(1.8);
+            }
+        });
+        let episodes: Vec<_> = (0..60)
+            .map(|k| {
+                let k = (k + first) % 60;
+                let steps = 1 + k * 7 % 12;
+                let observations: Vec<u8> = (0..=steps).map(|t| ((k + t * t) % 3) as u8).collect();
+                let actions: Vec<u8> = (0..steps).map(|t| ((k + t) % 5 % 2) as u8).collect();
+                tests::episode(k as u64, &observations, &actions, k % 4 == 0)
+            })
+            .collect();
+        let ppo = Ppo { minibatch_steps, minibatches, passes: 1, reward_scale: 0.1, ..Ppo::paper() };
+        let batch = Batch::new(&episodes, &Space::Discrete(2), &policy);
+        let old = batch.evaluate(&behaviour, &ppo);
+        let options = AdamOptions { beta1: 0.9, beta2: 0.999, epsilon: 1e-8, max_grad_norm: 0.0 };
+        let mut adam = Adam::new(policy.parameters(), options);
+        let schedule = Schedule { learning_rate: 0.0, kl_coef: 0.5 };
+        let mut rng = stream(seed, 0, 0, Purpose::Shuffle);
+        update(&policy, &mut adam, (&batch, &old), (&ppo, schedule), &mut rng, &|| false).unwrap()
+    }
+
+    /// Neither the order of episodes and minibatches nor what shares a minibatch, and so a packing, changes what is lost.
+    #[test]
+    fn losses_are_those_of_the_episodes() {
+        for memory in ["gru", "fart", "tcn"] {
+            let whole = losses_at_rest(memory, 0, 1 << 20, Minibatches::Shuffled, 0);
+            assert!(whole.kl > 1e-4 && whole.value_loss > 0.1, "the policies differ: {whole:?}");
+            for (first, minibatch_steps, minibatches, seed) in [
+                (0, 30, Minibatches::Shuffled, 0),
+                (0, 30, Minibatches::Shuffled, 1),
+                (0, 13, Minibatches::Fixed, 0),
+                (0, 13, Minibatches::Fixed, 1),
+                (17, 4, Minibatches::Shuffled, 2),
+                (41, 1 << 20, Minibatches::Fixed, 3),
+            ] {
+                let parts = losses_at_rest(memory, first, minibatch_steps, minibatches, seed);
+                for (name, found, expected) in [
+                    ("policy loss", parts.policy_loss, whole.policy_loss),
+                    ("value loss", parts.value_loss, whole.value_loss),
+                    ("KL", parts.kl, whole.kl),
+                    ("entropy", parts.entropy, whole.entropy),
+                ] {
+                    let what = format!("{memory}, {name}, minibatches of {minibatch_steps} steps, {minibatches:?}");
+                    assert!(
+                        (found - expected).abs() < 1e-5 * expected.abs().max(0.1),
+                        "{what}: {found} and {expected}"
+                    );
+                }
+            }
+        }
+    }
 
     /// Reference 3.5, by hand: clip 0.3, squared error clamped at 10. The three steps are: ratio 2 clipped to 1.3 with a
     /// gain; ratio 2 not clipped with a loss; ratio 0.5 clipped to 0.7 with a loss.

@@ -1,8 +1,9 @@
 //! Runs that end early, by Ctrl-C or as asked, and go on: `--continue`, `resume`, `resume --steps`.
 
+use std::collections::BTreeSet;
 use std::sync::LazyLock;
 
-use popgym_tests::process::Life;
+use popgym_tests::process::{Life, Program};
 use popgym_tests::{Process, Scene};
 use rustix::process::Signal;
 
@@ -71,6 +72,53 @@ fn continue_is_what_a_requeued_job_needs() {
     }
     continued(&scene, &STEPS).expect(0);
     assert_eq!(scene.metrics("run"), *UNDISTURBED);
+}
+
+/// Deaths one after the other, each at the next of the places around a row of metrics and a checkpoint: the n-th life ends
+/// at the n-th place that it comes to.
+fn deaths_between_any_two_writes_change_nothing(lag: &str) {
+    let flags = ["--lag", lag, "--checkpoint-epochs", "1", "--keep-checkpoints", "1", "--steps", "2048"];
+    let expected = Scene::new().curve("undisturbed", &flags);
+    let scene = Scene::new();
+    let mut places = BTreeSet::new();
+    for life in 1.. {
+        assert!(life < 60, "the run never ends");
+        let mut command = Program::Learner.command();
+        command.args(["train", "--config", "tiny.toml", "--out", "run", "--continue"]).args(flags);
+        command.current_dir(scene.path("")).env("POPGYM_FAIL_POINT", life.to_string());
+        let outcome = Process::start(&format!("life {life}"), command).wait();
+        let place = outcome.stderr.lines().find_map(|line| line.strip_prefix("POPGYM_FAIL_POINT: "));
+        let Some(place) = place else {
+            assert_eq!(outcome.status.code(), Some(0), "{}", outcome.stderr);
+            break;
+        };
+        places.insert(place.to_owned());
+    }
+    assert_eq!(scene.metrics("run"), expected);
+    assert_eq!(scene.checkpoints("run").last(), Some(&"epoch-000004".to_owned()));
+    let expected = [
+        "a checkpoint half removed",
+        "a checkpoint under its temporary name",
+        "a checkpoint whose name is not yet synced",
+        "a checkpoint without all its files",
+        "a checkpoint without its manifest",
+        "a record half written",
+        "a record not yet synced",
+        "an epoch reported and not saved",
+    ];
+    assert!(places.iter().eq(expected), "{places:?}");
+}
+
+#[test]
+#[cfg_attr(not(debug_assertions), ignore = "only a build with debug assertions has places to die at")]
+fn deaths_between_any_two_writes_change_nothing_without_lag() {
+    deaths_between_any_two_writes_change_nothing("0");
+}
+
+#[test]
+#[cfg_attr(not(debug_assertions), ignore = "only a build with debug assertions has places to die at")]
+fn deaths_between_any_two_writes_change_nothing_with_lag() {
+    deaths_between_any_two_writes_change_nothing("1");
 }
 
 #[test]
