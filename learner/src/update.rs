@@ -252,7 +252,7 @@ mod tests {
                 let steps = 1 + k * 7 % 12;
                 let observations: Vec<u8> = (0..=steps).map(|t| ((k + t * t) % 3) as u8).collect();
                 let actions: Vec<u8> = (0..steps).map(|t| ((k + t) % 5 % 2) as u8).collect();
-                tests::episode(k as u64, &observations, &actions, k % 4 == 0)
+                tests::episode(k as u64, &observations, &actions, k.is_multiple_of(4))
             })
             .collect();
         let ppo = Ppo { minibatch_steps, minibatches, passes: 1, reward_scale: 0.1, ..Ppo::paper() };

@@ -3,7 +3,7 @@
 use plotters::coord::ranged1d::{KeyPointHint, Ranged};
 use plotters::prelude::*;
 
-use super::{BAND, GRID, Pen, SvgArea, TEXT, short, value_range};
+use super::{Axis, BAND, Pen, SvgArea, axes, value_range};
 
 /// A chart of curves.
 pub(crate) struct Lines {
@@ -58,27 +58,9 @@ impl Lines {
         let inner = self.series.iter().flat_map(|series| series.points.iter().map(|point| point.1));
         let bands = self.series.iter().flat_map(|series| series.band.iter().flat_map(|(_, low, high)| [*low, *high]));
         let px = |length| pen.px(length);
-        let mut chart = ChartBuilder::on(area)
-            .margin_right(px(16))
-            .margin_top(px(4))
-            .x_label_area_size(px(38))
-            .y_label_area_size(px(50))
-            .build_cartesian_2d(FewTicks(0.0..end * 1.01), value_range(inner.chain(bands)))?;
-        chart
-            .configure_mesh()
-            .light_line_style(TRANSPARENT)
-            .bold_line_style(GRID.stroke_width(px(1)))
-            .axis_style(TEXT.stroke_width(px(1)))
-            .set_all_tick_mark_size(px(3))
-            .label_style(pen.text(11))
-            .axis_desc_style(pen.text(11))
-            .x_desc(&self.x_desc)
-            .y_desc(&self.y_desc)
-            .x_labels(5)
-            .y_labels(7)
-            .x_label_formatter(&|x| short(*x))
-            .y_label_formatter(&|y| short(*y))
-            .draw()?;
+        let x = Axis { range: FewTicks(0.0..end * 1.01), desc: &self.x_desc, labels: 5 };
+        let y = Axis { range: value_range(inner.chain(bands)), desc: &self.y_desc, labels: 7 };
+        let mut chart = axes(area, pen, x, y)?;
         for Series { band, colour, .. } in &self.series {
             if band.len() > 1 {
                 let lower = band.iter().map(|(x, low, _)| (*x, *low));

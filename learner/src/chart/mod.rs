@@ -5,8 +5,10 @@ use plotters::coord::Shift;
 use plotters::prelude::*;
 use plotters::style::{FontFamily, FontStyle, register_font};
 
+mod axes;
 mod lines;
 
+pub(crate) use axes::{Axis, axes};
 pub(crate) use lines::{Lines, Series};
 
 /// Name under which the font is known here, and a list of families where an SVG is viewed.

@@ -244,8 +244,11 @@ pub fn grid(figures: &[Figure]) -> Markup {
     }
 }
 
-/// A table that scrolls in its own box where it is too wide.
+/// A table that scrolls in its own box where it is too wide; without rows, a sentence.
 pub fn table(head: &[&str], rows: &[Vec<String>]) -> Markup {
+    if rows.is_empty() {
+        return html! { p { "There are none." } };
+    }
     // Numbers stand right, text left, and long text has room for several lines.
     let class = |cell: &str| {
         let number = cell.starts_with(|c: char| c.is_ascii_digit() || "+-–".contains(c));

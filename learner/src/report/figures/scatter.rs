@@ -3,7 +3,7 @@
 use plotters::prelude::*;
 
 use super::{Figure, Section, WIDTH, behind, colour};
-use crate::chart::{FINE, GRID, SvgArea, TEXT, short, svg};
+use crate::chart::{Axis, FINE, SvgArea, TEXT, axes, svg};
 use crate::report::cell::Cell;
 
 /// A figure for each group of environments and preset.
@@ -43,27 +43,8 @@ fn draw(area: &SvgArea<'_>, title: &str, cells: &[&Cell]) -> anyhow::Result<()> 
     let px = |length| FINE.px(length);
     area.draw_text(title, &FINE.text(13), FINE.at(8.0, 8.0))?;
     let (_, plot) = area.split_vertically(px(26));
-    let mut chart = ChartBuilder::on(&plot)
-        .margin_right(px(16))
-        .margin_top(px(4))
-        .x_label_area_size(px(38))
-        .y_label_area_size(px(50))
-        .build_cartesian_2d(-1.1..1.1, -1.1..1.1)?;
-    chart
-        .configure_mesh()
-        .light_line_style(TRANSPARENT)
-        .bold_line_style(GRID.stroke_width(px(1)))
-        .axis_style(TEXT.stroke_width(px(1)))
-        .set_all_tick_mark_size(px(3))
-        .label_style(FINE.text(11))
-        .axis_desc_style(FINE.text(11))
-        .x_desc("paper, MMER")
-        .y_desc("here, MMER-65k")
-        .x_labels(5)
-        .y_labels(5)
-        .x_label_formatter(&|x| short(*x))
-        .y_label_formatter(&|y| short(*y))
-        .draw()?;
+    let axis = |desc| Axis { range: -1.1..1.1, desc, labels: 5 };
+    let mut chart = axes(&plot, FINE, axis("paper, MMER"), axis("here, MMER-65k"))?;
     chart.draw_series([PathElement::new(vec![(-1.1, -1.1), (1.1, 1.1)], TEXT.stroke_width(px(1)))])?;
     let point = |cell: &&Cell| Some((cell.paper?.mean, cell.mmer_65k?.mean, colour(&cell.paper_memory)));
     let points = cells.iter().filter_map(point);
