@@ -19,6 +19,7 @@ use tch::{Kind, Tensor};
 
 use crate::adam::AdamState;
 use crate::fail_point;
+use crate::files;
 
 const FORMAT: u32 = 1;
 const MANIFEST: &str = "manifest.json";
@@ -101,12 +102,12 @@ impl Checkpoint {
             files,
         };
         write_synced(&temporary.join(MANIFEST), &serde_json::to_vec_pretty(&manifest)?)?;
-        sync_dir(&temporary)?;
+        files::sync_dir(&temporary);
         fail_point::reached("a checkpoint under its temporary name");
         remove_dir_if_there(&path)?;
         fs::rename(&temporary, &path).with_context(|| format!("cannot rename {}", temporary.display()))?;
         fail_point::reached("a checkpoint whose name is not yet synced");
-        sync_dir(dir)?;
+        files::sync_dir(dir);
         Ok(path)
     }
 
@@ -252,10 +253,6 @@ fn write_synced(path: &Path, bytes: &[u8]) -> anyhow::Result<()> {
         file.sync_all()
     };
     write().with_context(|| format!("cannot write {}", path.display()))
-}
-
-fn sync_dir(path: &Path) -> anyhow::Result<()> {
-    File::open(path).and_then(|dir| dir.sync_all()).with_context(|| format!("cannot sync {}", path.display()))
 }
 
 fn remove_dir_if_there(path: &Path) -> anyhow::Result<()> {

@@ -14,7 +14,6 @@ use serde::{Deserialize, Serialize};
 use tch::Device;
 use toml::{Table, Value};
 
-use crate::checkpoint::Progress;
 pub use crate::ppo_keys::{LearningRateSchedule, Ppo, PpoFlags};
 
 /// The presets' names, with what each is for.
@@ -160,12 +159,12 @@ impl Config {
     }
 
     /// Why a run that stands at `progress` is complete, if it is.
-    pub fn reached(&self, progress: &Progress) -> Option<&'static str> {
+    pub fn reached(&self, env_steps: u64, mmer: Option<f64>) -> Option<&'static str> {
         let target = self.stop_at_mmer.unwrap_or(f64::INFINITY);
-        if progress.mmer.is_some_and(|mmer| mmer >= target) {
+        if mmer.is_some_and(|mmer| mmer >= target) {
             Some("mmer")
         } else {
-            (progress.env_steps >= self.steps).then_some("steps")
+            (env_steps >= self.steps).then_some("steps")
         }
     }
 

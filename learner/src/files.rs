@@ -16,9 +16,8 @@ pub(crate) fn replace(path: &Path, write: impl FnOnce(&Path) -> anyhow::Result<(
         write(&partial)?;
         File::open(&partial)?.sync_all()?;
         fs::rename(&partial, path)?;
-        // The rename itself is durable once the directory is; not every file system can sync one.
-        if let Some(dir) = path.parent().and_then(|dir| File::open(dir).ok()) {
-            let _ = dir.sync_all();
+        if let Some(dir) = path.parent() {
+            sync_dir(dir);
         }
         Ok(())
     })();
@@ -26,6 +25,11 @@ pub(crate) fn replace(path: &Path, write: impl FnOnce(&Path) -> anyhow::Result<(
         let _ = fs::remove_file(&partial);
     }
     done.with_context(|| format!("cannot write {}", path.display()))
+}
+
+/// Makes renames in `dir` durable; not every file system can.
+pub(crate) fn sync_dir(dir: &Path) {
+    let _ = File::open(dir).and_then(|dir| dir.sync_all());
 }
 
 /// Checks that [`replace`] can begin: that there is no directory at `path`, and that its own can be written to.

@@ -8,8 +8,12 @@ use anyhow::{Context, bail};
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 
+use crate::checkpoint;
 use crate::config::Config;
 use crate::files;
+use crate::observer::{MetricsCsv, Summary, SummaryJson};
+
+const CHECKPOINTS: &str = "checkpoints";
 
 /// A run directory that this process holds the lock of.
 pub struct RunDir {
@@ -92,8 +96,20 @@ impl RunDir {
 
     /// Where its checkpoints are.
     pub fn checkpoints(&self) -> PathBuf {
-        self.path.join("checkpoints")
+        self.path.join(CHECKPOINTS)
     }
+}
+
+/// The summary of the run in `path`, if the run has nothing left to do: it has come to the end that `config` says, its metrics
+/// too, and its last weights were saved (or all checkpoints were removed since).
+pub(crate) fn finished(path: &Path, config: &Config) -> Option<Summary> {
+    let summary: Summary = serde_json::from_slice(&fs::read(path.join(SummaryJson::FILE)).ok()?).ok()?;
+    let ended = summary.stopped_by != "interrupt" && config.reached(summary.env_steps, summary.mmer).is_some();
+    let last = MetricsCsv::read(path).ok()?.pop()?;
+    let dir = path.join(CHECKPOINTS);
+    let checkpoints = checkpoint::list(&dir).ok()?;
+    let saved = checkpoints.is_empty() || checkpoints.contains(&checkpoint::path(&dir, summary.epochs));
+    (ended && last.env_steps == summary.env_steps && saved).then_some(summary)
 }
 
 /// An id that no other run has: of this time, this process and this directory.
@@ -105,7 +121,11 @@ fn fresh_run_id(path: &Path) -> String {
 
 /// Whether a learner is working in the run directory `path`.
 pub(crate) fn is_locked(path: &Path) -> bool {
-    File::open(path.join("lock")).is_ok_and(|file| matches!(file.try_lock(), Err(TryLockError::WouldBlock)))
+    // For writing: NFS grants exclusive locks on nothing less.
+    File::options()
+        .write(true)
+        .open(path.join("lock"))
+        .is_ok_and(|file| matches!(file.try_lock(), Err(TryLockError::WouldBlock)))
 }
 
 fn lock(path: &Path) -> anyhow::Result<File> {

@@ -74,7 +74,7 @@ impl Trainer<'_> {
         let mut state = self.start(from)?;
         self.open(&state)?;
         let stopped_by = loop {
-            if let Some(reason) = self.config.reached(&state.progress) {
+            if let Some(reason) = self.reached(&state.progress) {
                 break reason;
             }
             match self.epoch(&mut state) {
@@ -136,7 +136,7 @@ impl Trainer<'_> {
     /// Opens the sampling of the session's first epoch.
     fn open(&self, state: &State) -> anyhow::Result<()> {
         let epoch = state.progress.epoch;
-        if self.config.reached(&state.progress).is_some() {
+        if self.reached(&state.progress).is_some() {
             return Ok(());
         }
         self.open_epoch(epoch, epoch.saturating_sub(u64::from(self.config.lag)), state.snapshot.sampling.clone())
@@ -163,7 +163,7 @@ impl Trainer<'_> {
         // COLLECTED: with lag 1 the next epoch is sampled from here on, with the weights as they are now.
         let pipelined = self.config.lag == 1;
         let newest = state.snapshot.weights.clone();
-        if pipelined && self.config.reached(&state.progress).is_none() {
+        if pipelined && self.reached(&state.progress).is_none() {
             self.open_epoch(epoch + 1, epoch, newest.clone())?;
         }
 
@@ -205,7 +205,7 @@ impl Trainer<'_> {
         if !pipelined {
             // Refuses weights that are not finite, before the snapshot becomes what a checkpoint holds.
             self.behaviour.load(&sampling)?;
-            if self.config.reached(&state.progress).is_none() {
+            if self.reached(&state.progress).is_none() {
                 self.open_epoch(epoch + 1, epoch + 1, sampling.clone())?;
             }
         }
@@ -234,6 +234,11 @@ impl Trainer<'_> {
             let _ = self.save(state);
         }
         Ok(true)
+    }
+
+    /// Why the run has come to its end, if it has.
+    fn reached(&self, progress: &Progress) -> Option<&'static str> {
+        self.config.reached(progress.env_steps, progress.mmer)
     }
 
     fn schedule(&self, progress: &Progress) -> Schedule {

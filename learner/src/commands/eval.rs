@@ -30,7 +30,8 @@ struct Report {
     greedy: bool,
     episodes: usize,
     mean_return: f64,
-    standard_error: f64,
+    /// None of a single episode.
+    standard_error: Option<f64>,
     min_return: f64,
     median_return: f64,
     max_return: f64,
@@ -141,7 +142,7 @@ fn report(config: &Config, trained_on: String, greedy: bool, checkpoint_epoch: u
         episodes: returns.len(),
         mean_return: statistics::mean(&returns).unwrap_or(f64::NAN),
         // Of the mean; a single episode tells nothing of it.
-        standard_error: standard_deviation.map_or(f64::NAN, |deviation| deviation / (returns.len() as f64).sqrt()),
+        standard_error: standard_deviation.map(|deviation| deviation / (returns.len() as f64).sqrt()),
         min_return: quantile(0),
         median_return: quantile(50),
         max_return: quantile(100),
@@ -170,10 +171,11 @@ fn lines(report: &Report) -> String {
     let how = if report.greedy { ", likeliest actions" } else { "" };
     let quantiles: Vec<String> =
         report.quantiles.iter().map(|(percent, value)| format!("{percent}%: {value:.4}")).collect();
+    let error = report.standard_error.map_or_else(String::new, |error| format!(" +- {error:.4} (standard error)"));
     let mut lines = vec![
         format!("{} on {}, weights of epoch {}{other}{how}", report.memory, report.env, report.checkpoint_epoch),
         format!("episodes           {} (seed {})", report.episodes, report.seed),
-        format!("mean return        {:.4} +- {:.4} (standard error)", report.mean_return, report.standard_error),
+        format!("mean return        {:.4}{error}", report.mean_return),
         format!("min, median, max   {:.4}  {:.4}  {:.4}", report.min_return, report.median_return, report.max_return),
         format!("quantiles          {}", quantiles.join("  ")),
         format!("mean length        {:.1} steps", report.mean_length),

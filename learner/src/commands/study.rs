@@ -25,7 +25,7 @@ pub struct StudyRunArgs {
     /// Trials at a time [default: one a core]
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=256))]
     pub jobs: Option<u32>,
-    /// Run this trial only (`learner study list`), as a task of a Slurm array or an indexed job does
+    /// Run this trial only (`learner study list`), as a task of a Slurm array or an indexed job does; exits 0 only if it is done
     #[arg(long, value_name = "K", conflicts_with = "jobs")]
     pub index: Option<usize>,
     /// Try those again, too, that have failed three times
@@ -90,7 +90,9 @@ pub fn study_run(args: &StudyRunArgs, extensions: &Extensions) -> Outcome {
     let jobs = args.jobs.map_or(cores, |jobs| jobs as usize);
     let tally = Runner::new(&dir, wanted, &interrupt).run(jobs)?;
     say(&describe(tally, wanted, &dir))?;
-    Ok(if tally.left > 0 { EXIT_INTERRUPTED } else { u8::from(tally.failed > 0) })
+    // A task of an array has not done its work while another process is at it.
+    let missing = tally.failed > 0 || (args.index.is_some() && tally.elsewhere > 0);
+    Ok(if tally.left > 0 { EXIT_INTERRUPTED } else { u8::from(missing) })
 }
 
 fn describe(tally: Tally, trials: &[Trial], dir: &StudyDir) -> String {

@@ -1,6 +1,6 @@
 //! `learner train` and `learner resume`.
 
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use tch::Device;
 
@@ -13,9 +13,9 @@ use crate::files;
 use crate::interrupt::{EXIT_INTERRUPTED, Interrupt};
 use crate::manifest;
 use crate::observer::{
-    Curve, MetricsCsv, Observer, Progress, Prometheus, RunStart, Summary, SummaryJson, TensorBoard, TimingCsv,
+    Curve, MetricsCsv, Observer, Progress, Prometheus, RunStart, SummaryJson, TensorBoard, TimingCsv,
 };
-use crate::run_dir::RunDir;
+use crate::run_dir::{self, RunDir};
 use crate::session::Session;
 use crate::trainer::Trainer;
 
@@ -108,12 +108,12 @@ fn carry_out(
     if with_parent {
         interrupt.with_parent()?;
     }
-    let rows = MetricsCsv::read(dir.path()).map_or(0, |rows| rows.len() as u64);
-    let checkpoint = Checkpoint::latest(&dir.checkpoints(), session.parameters(), rows)?;
-    if let Some(path) = complete(dir, config, checkpoint.as_ref()) {
-        say(&format!("already complete: {}", path.display()))?;
+    if run_dir::finished(dir.path(), config).is_some() {
+        say(&format!("already complete: {}", dir.path().join(SummaryJson::FILE).display()))?;
         return Ok(0);
     }
+    let rows = MetricsCsv::read(dir.path()).map_or(0, |rows| rows.len() as u64);
+    let checkpoint = Checkpoint::latest(&dir.checkpoints(), session.parameters(), rows)?;
     // What was asked for now is what the directory says from now on.
     files::write(&RunDir::config_path(dir.path()), &config.to_toml()?)?;
     let (policy, behaviour) = (session.first_policy()?, session.policy()?);
@@ -135,15 +135,6 @@ fn carry_out(
     let interrupted = summary.stopped_by == "interrupt";
     session.end(if interrupted { None } else { Some("the run is complete") });
     Ok(if interrupted { EXIT_INTERRUPTED } else { 0 })
-}
-
-/// The summary of a run that has nothing left to do: it is of the newest checkpoint, and that is far enough.
-fn complete(dir: &RunDir, config: &Config, checkpoint: Option<&Checkpoint>) -> Option<PathBuf> {
-    let progress = &checkpoint?.progress;
-    let path = dir.path().join(SummaryJson::FILE);
-    let summary: Summary = serde_json::from_slice(&std::fs::read(&path).ok()?).ok()?;
-    let ended = summary.epochs == progress.epoch && summary.stopped_by != "interrupt";
-    (ended && config.reached(progress).is_some()).then_some(path)
 }
 
 fn observers(

@@ -18,9 +18,8 @@ use serde::{Deserialize, Serialize};
 
 use super::plan::{self, Trial};
 use crate::Extensions;
-use crate::checkpoint;
 use crate::files::{self, AppendFile};
-use crate::observer::{Summary, SummaryJson};
+use crate::observer::Summary;
 use crate::run_dir;
 
 /// A trial that has failed as often is not tried again.
@@ -75,6 +74,7 @@ impl StudyDir {
         let _locked = locked.with_context(|| format!("cannot lock {}", lock.display()))?;
         let file = path.join("study.toml");
         match fs::read_to_string(&file) {
+            Ok(known) if known == text => return Ok(dir),
             Ok(known) => {
                 let known = plan::parse(&known, extensions).with_context(|| file.display().to_string())?;
                 if let Some(difference) = plan::difference(&known, trials) {
@@ -124,7 +124,7 @@ impl StudyDir {
     /// How a trial stands. What cannot be read does not count.
     pub fn standing(&self, trial: &Trial) -> Standing {
         let run = self.run(trial);
-        if self.summary(trial).is_some_and(|summary| ended(&run, trial, &summary)) {
+        if self.summary(trial).is_some() {
             Standing::Done
         } else if self.failures(trial).len() >= ATTEMPTS {
             Standing::Failed
@@ -135,15 +135,15 @@ impl StudyDir {
         }
     }
 
-    /// What a trial's run came to.
+    /// What a trial's run came to, if it has ended as it should.
     pub fn summary(&self, trial: &Trial) -> Option<Summary> {
-        serde_json::from_slice(&fs::read(self.run(trial).join(SummaryJson::FILE)).ok()?).ok()
+        run_dir::finished(&self.run(trial), &trial.config)
     }
 
     /// How a trial has failed so far. A torn last line does not count.
     pub fn failures(&self, trial: &Trial) -> Vec<Failure> {
-        let text = fs::read_to_string(self.beside(trial, "failures")).unwrap_or_default();
-        text.lines().filter_map(|line| serde_json::from_str(line).ok()).collect()
+        let bytes = fs::read(self.beside(trial, "failures")).unwrap_or_default();
+        String::from_utf8_lossy(&bytes).lines().filter_map(|line| serde_json::from_str(line).ok()).collect()
     }
 
     /// Notes a failed attempt.
@@ -193,19 +193,10 @@ impl StudyDir {
     }
 }
 
-/// Whether the run has come to its end, with its last checkpoint.
-fn ended(run: &Path, trial: &Trial, summary: &Summary) -> bool {
-    let config = &trial.config;
-    let far_enough = summary.env_steps >= config.steps
-        || config.stop_at_mmer.is_some_and(|target| summary.mmer.is_some_and(|mmer| mmer >= target));
-    far_enough
-        && summary.stopped_by != "interrupt"
-        && checkpoint::path(&run.join("checkpoints"), summary.epochs).is_dir()
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::observer::{MetricsCsv, Observer as _, samples};
 
     const STUDY: &str = "[[product]]\nenvs = ['RepeatFirstEasy']\nmemories = ['mlp', 'gru']\nseeds = [0]\n";
 
@@ -238,6 +229,9 @@ mod tests {
             wall_seconds: 1.0,
             stopped_by: "steps".to_owned(),
         };
+        let mut report = samples::report(0);
+        report.metrics.env_steps = 1_000_000;
+        MetricsCsv::open(&dir.run(trial), 0).unwrap().epoch(&report).unwrap();
         let mut standing = |change: &dyn Fn(&mut Summary)| {
             change(&mut summary);
             fs::write(dir.run(trial).join("summary.json"), serde_json::to_string(&summary).unwrap()).unwrap();
@@ -250,6 +244,9 @@ mod tests {
             standing(&|summary| (summary.stopped_by, summary.epochs) = ("steps".to_owned(), 4)),
             Standing::Begun
         );
+        fs::remove_dir(dir.run(trial).join("checkpoints/epoch-000003")).unwrap();
+        assert_eq!(standing(&|_| {}), Standing::Done, "what is done needs no checkpoints");
+        assert_eq!(standing(&|summary| summary.env_steps += 1), Standing::Begun, "the metrics are of another end");
         fs::write(dir.run(trial).join("summary.json"), "{").unwrap();
         assert_eq!(dir.standing(trial), Standing::Begun);
         assert_eq!(dir.standing(&trials[1]), Standing::Fresh);
@@ -262,7 +259,8 @@ mod tests {
             |n: u32| Failure { status: format!("exit status: {n}"), error: "error: \"no\"\nspace".to_owned() };
         dir.note_failure(&trials[0], &failure(1)).unwrap();
         let path = temporary.path().join("trials").join(format!("{}.failures", trials[0].name));
-        let torn = fs::read_to_string(&path).unwrap() + "{\"status\": \"exi";
+        // In the middle of a character, too.
+        let torn = [&fs::read(&path).unwrap(), &b"{\"status\": \"\xe2\x80"[..]].concat();
         fs::write(&path, torn).unwrap();
         dir.note_failure(&trials[0], &failure(2)).unwrap();
         assert_eq!(dir.failures(&trials[0]), [failure(1), failure(2)]);

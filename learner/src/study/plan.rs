@@ -61,7 +61,8 @@ pub struct Trial {
 /// The text of the study file `path` and its trials, in the order of its products, and within one of its environments, memories and
 /// seeds as they are listed. A trial that several products name is there once.
 ///
-/// Trials have one thread and one actor unless the file says otherwise: a study's parallelism is between its trials.
+/// Trials have one thread, one actor and no GPU unless the file says otherwise: a study's parallelism is between its trials, and
+/// one that was begun on one machine goes on on another.
 ///
 /// # Errors
 /// The file cannot be read; or what in it is unknown, empty or impossible.
@@ -164,6 +165,7 @@ fn check_run(run: &Table) -> anyhow::Result<()> {
 fn given(run: &Table, selections: &[Selection<'_>], env: &Entry, memory: &str, seed: u64) -> Table {
     let mut given = Table::from_iter([
         ("threads".to_owned(), Value::Integer(1)),
+        ("device".to_owned(), Value::String("cpu".to_owned())),
         ("service".to_owned(), Value::Table(Table::from_iter([("actors".to_owned(), Value::Integer(1))]))),
     ]);
     config::merge(&mut given, run);

@@ -3,6 +3,7 @@
 use std::collections::VecDeque;
 use std::fs::{self, File};
 use std::os::unix::process::CommandExt as _;
+use std::path::Path;
 use std::process::{Child, Command, ExitStatus, Stdio};
 use std::time::Duration;
 
@@ -45,6 +46,8 @@ struct Running<'a> {
     trial: &'a Trial,
     /// None: the learner of an earlier session has still to end.
     child: Option<Child>,
+    /// Length of the trial's log when the child was started.
+    said_before: u64,
     _claim: Claim,
 }
 
@@ -92,7 +95,7 @@ impl<'a> Runner<'a> {
         let Some(claim) = self.dir.claim(trial)? else {
             info!("{}: another process is running it", trial.name);
             self.tally.elsewhere += 1;
-            self.view.ended(trial);
+            self.view.elsewhere(trial);
             return Ok(true);
         };
         // Another process may have been faster.
@@ -100,11 +103,11 @@ impl<'a> Runner<'a> {
             Standing::Done => self.tally.done += 1,
             Standing::Failed => self.tally.failed += 1,
             Standing::Begun | Standing::Fresh => {
-                self.running.push(Running { trial, child: None, _claim: claim });
+                self.running.push(Running { trial, child: None, said_before: 0, _claim: claim });
                 return Ok(true);
             }
         }
-        self.view.ended(trial);
+        self.view.elsewhere(trial);
         Ok(true)
     }
 
@@ -112,6 +115,7 @@ impl<'a> Runner<'a> {
         for mut running in std::mem::take(&mut self.running) {
             let Some(child) = &mut running.child else {
                 if !self.dir.is_occupied(running.trial) {
+                    running.said_before = fs::metadata(self.dir.log(running.trial)).map_or(0, |log| log.len());
                     running.child = Some(start(self.dir, running.trial)?);
                 }
                 self.running.push(running);
@@ -119,13 +123,14 @@ impl<'a> Runner<'a> {
             };
             match child.try_wait().with_context(|| format!("{}: cannot wait for it", running.trial.name))? {
                 None => self.running.push(running),
-                Some(status) => self.ended(running.trial, status)?,
+                Some(status) => self.ended(&running, status)?,
             }
         }
         Ok(())
     }
 
-    fn ended(&mut self, trial: &'a Trial, status: ExitStatus) -> anyhow::Result<()> {
+    fn ended(&mut self, running: &Running<'a>, status: ExitStatus) -> anyhow::Result<()> {
+        let trial = running.trial;
         if status.success() && self.dir.standing(trial) == Standing::Done {
             self.tally.done += 1;
             self.view.ended(trial);
@@ -135,7 +140,8 @@ impl<'a> Runner<'a> {
             }
             return Ok(());
         }
-        let failure = Failure { status: status.to_string(), error: last_words(self.dir, trial) };
+        let failure =
+            Failure { status: status.to_string(), error: last_words(&self.dir.log(trial), running.said_before) };
         self.dir.note_failure(trial, &failure)?;
         let failures = self.dir.failures(trial).len();
         warn!("{} failed ({}), attempt {failures} of {ATTEMPTS}: {}", trial.name, failure.status, failure.error);
@@ -177,11 +183,29 @@ fn start(dir: &StudyDir, trial: &Trial) -> anyhow::Result<Child> {
     command.spawn().with_context(|| format!("cannot start {}", program.display()))
 }
 
-/// The last error in a trial's log, or its last line.
-fn last_words(dir: &StudyDir, trial: &Trial) -> String {
-    let log = fs::read(dir.log(trial)).unwrap_or_default();
-    let log = String::from_utf8_lossy(&log);
+/// The last error in a log from byte `start` on, or its last line.
+fn last_words(log: &Path, start: u64) -> String {
+    let log = fs::read(log).unwrap_or_default();
+    let log = String::from_utf8_lossy(log.get(start as usize..).unwrap_or_default());
     let mut lines = log.lines().rev().filter(|line| !line.trim().is_empty());
     let last = lines.clone().next().unwrap_or("nothing was said");
     lines.find(|line| line.starts_with("error:")).unwrap_or(last).to_owned()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_last_words_are_those_of_this_attempt() {
+        let dir = tempfile::tempdir().unwrap();
+        let log = dir.path().join("log");
+        assert_eq!(last_words(&log, 0), "nothing was said");
+        fs::write(&log, "error: no actors\nINFO \u{2014}\n\n").unwrap();
+        assert_eq!(last_words(&log, 0), "error: no actors");
+        assert_eq!(last_words(&log, 17), "INFO \u{2014}");
+        // Begun in the middle of a character, or behind the end.
+        assert_eq!(last_words(&log, 23), "\u{fffd}\u{fffd}");
+        assert_eq!(last_words(&log, 1000), "nothing was said");
+    }
 }

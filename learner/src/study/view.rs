@@ -42,9 +42,17 @@ impl<'a> View<'a> {
         Self { dir, bars, pace, read: None, printed: None }
     }
 
-    /// A trial has ended, or is not ours.
+    /// A trial has ended.
     pub(super) fn ended(&mut self, trial: &Trial) {
         self.pace.ended(trial.number);
+    }
+
+    /// A trial is another process's work.
+    pub(super) fn elsewhere(&mut self, trial: &Trial) {
+        self.pace.elsewhere(trial.number);
+        if let Some(bars) = &self.bars {
+            bars.all.set_length(self.pace.total);
+        }
     }
 
     /// Shows the trials that run, now and then.
@@ -149,6 +157,12 @@ impl Pace {
         }
     }
 
+    fn elsewhere(&mut self, number: usize) {
+        if let Some((budget, done)) = self.trials.remove(&number) {
+            self.total -= budget.saturating_sub(done);
+        }
+    }
+
     /// Of `total`, what is done, given the steps of the trials that run.
     fn progress(&self, running: impl Iterator<Item = (usize, u64)>) -> u64 {
         let of_trial = |(number, steps): (usize, u64)| {
@@ -179,8 +193,10 @@ mod tests {
         assert_eq!(pace.progress([(1, 50), (7, 90)].into_iter()), 200);
         pace.ended(0);
         assert_eq!(pace.progress(std::iter::empty()), 100, "it ends once");
+        pace.elsewhere(1);
+        assert_eq!((pace.total, pace.progress(std::iter::empty())), (400, 100), "what others do is not ours");
         assert_eq!(pace.eta(0), None);
         pace.began = Instant::now().checked_sub(Duration::from_secs(50)).unwrap();
-        assert!((pace.eta(115).unwrap() - 150.0).abs() < 1.0);
+        assert!((pace.eta(100).unwrap() - 150.0).abs() < 1.0);
     }
 }
