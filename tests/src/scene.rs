@@ -54,12 +54,14 @@ impl Scene {
         self.dir.path().join(name)
     }
 
-    /// Writes a file.
+    /// Writes a file, in new directories if need be.
     ///
     /// # Panics
     /// If it cannot be written.
     pub fn write(&self, name: &str, text: &str) {
-        fs::write(self.path(name), text).expect("a file in the scene");
+        let path = self.path(name);
+        fs::create_dir_all(path.parent().expect("a file has a directory")).expect("a directory in the scene");
+        fs::write(path, text).expect("a file in the scene");
     }
 
     /// Reads a file.

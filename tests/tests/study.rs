@@ -87,6 +87,66 @@ fn a_study_runs_its_trials_and_only_those_left() {
     scene.write("study.toml", &STUDY.replace("seeds = [3]", "seeds = [4]"));
     let outcome = run(&scene, &[]).expect(2);
     assert!(outcome.stderr.contains("another study") && outcome.stderr.contains("seed4"), "{}", outcome.stderr);
+
+    // Checkpoints may go once a run is done.
+    scene.write("study.toml", STUDY);
+    let metrics = scene.metrics(&format!("study/trials/{name}"));
+    fs::remove_dir_all(scene.path(&format!("study/trials/{name}/checkpoints"))).unwrap();
+    run(&scene, &[]).expect(0);
+    let again = scene.resume(&format!("study/trials/{name}"), &[]).expect(0);
+    assert!(again.stdout.contains("already complete"), "{}", again.stdout);
+    assert_eq!(scene.metrics(&format!("study/trials/{name}")), metrics);
+
+    assert_reported(&scene);
+    assert_compared(&scene);
+}
+
+/// A column of a table with a head.
+fn column<'a>(table: &'a str, name: &str) -> Vec<&'a str> {
+    let mut lines = table.lines().map(|line| line.split(',').collect::<Vec<_>>());
+    let head = lines.next().unwrap();
+    let column = head.iter().position(|known| *known == name).unwrap_or_else(|| panic!("no {name} in {head:?}"));
+    lines.map(|line| line[column]).collect()
+}
+
+/// The report says what the runs' own files say, and names what it cannot read.
+fn assert_reported(scene: &Scene) {
+    let report = |flags: &[&str]| scene.learner(&[&["study", "report"], flags].concat());
+    report(&["study"]).expect(0);
+    let reported = scene.read("study/report/runs.csv");
+    let (dirs, steps, mmers) = (column(&reported, "dir"), column(&reported, "steps"), column(&reported, "mmer"));
+    assert_eq!(dirs.len(), TRIALS);
+    for ((dir, steps), mmer) in dirs.iter().zip(steps).zip(mmers) {
+        let metrics = scene.metrics(dir);
+        assert_eq!(column(&metrics, "env_steps").last(), Some(&steps), "{dir}");
+        let returns = column(&metrics, "mean_return").into_iter().map(|value| value.parse::<f64>().unwrap());
+        assert!((returns.fold(f64::NEG_INFINITY, f64::max) - mmer.parse::<f64>().unwrap()).abs() < 1e-12, "{dir}");
+    }
+
+    scene.write("odd/half/config.toml", "env = ");
+    let old = scene.metrics(dirs[0]).replace("epoch_return,", "");
+    for (file, text) in [("config.toml", scene.read(&format!("{}/config.toml", dirs[0]))), ("metrics.csv", old)] {
+        scene.write(&format!("odd/old/{file}"), &text);
+    }
+    let notes = report(&["study", "odd", "--out", "both"]).expect(0).stderr;
+    assert_eq!(notes.lines().count(), 2, "{notes}");
+    assert!(notes.contains("odd/half: left out:") && notes.contains("odd/old: left out:"), "{notes}");
+    assert_eq!(column(&scene.read("both/runs.csv"), "dir"), dirs);
+    let refused = report(&["odd"]).expect(2).stderr;
+    assert_eq!(refused.trim_end().lines().last(), Some("error: no run in odd can be reported"));
+    fs::create_dir(scene.path("empty")).unwrap();
+    let refused = report(&["empty"]).expect(2).stderr;
+    assert!(refused.starts_with("error: empty holds no run") && refused.trim_end().lines().count() == 1, "{refused}");
+}
+
+fn assert_compared(scene: &Scene) {
+    let run = |name: &str| format!("study/trials/{name}");
+    let (mlp, gru) = (run("0000-RepeatFirstEasy-mlp-seed3"), run("0001-RepeatFirstEasy-gru-seed3"));
+    let said = scene.learner(&["compare", &mlp, &gru]).expect(0).stdout;
+    assert!(said.contains("mlp") && said.contains("gru") && scene.path("compare/compare.html").exists(), "{said}");
+    let refused = scene.learner(&["compare", &mlp, "empty"]).expect(2).stderr;
+    assert!(refused.starts_with("error: ") && refused.contains("empty"), "{refused}");
+    assert_eq!(refused.trim_end().lines().count(), 1, "{refused}");
 }
 
 #[test]
