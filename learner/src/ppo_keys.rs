@@ -55,7 +55,7 @@ ppo_keys! {
     /// Lambda of generalised advantage estimation
     gae_lambda: f64 = 1.0, |_: &Quick| 0.95;
     /// The surrogate's ratio is clipped to 1 - clip .. 1 + clip
-    clip: f64 = 0.3, |_: &Quick| 0.2;
+    clip: f64 = 0.3, |_: &Quick| 0.3;
     /// The critic's squared error is clamped to 0 .. value_clip (inf: never)
     value_clip: f64 = 10.0, |_: &Quick| f64::INFINITY;
     /// Weight of the critic's loss
