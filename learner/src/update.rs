@@ -72,7 +72,7 @@ pub fn update(
     interrupted: &dyn Fn() -> bool,
 ) -> Result<UpdateMeans, UpdateError> {
     let mut totals = Totals::new(policy.device());
-    for pass in 1..=ppo.passes {
+    'passes: for pass in 1..=ppo.passes {
         for (episodes, number) in minibatches(&batch.lengths, ppo, rng).into_iter().zip(1..) {
             if interrupted() {
                 return Err(UpdateError::Interrupted);
@@ -88,6 +88,10 @@ pub fn update(
             );
 
             let losses = minibatch.losses(&scores, &outputs.values, ppo);
+            // The policy has already moved far enough from the one that sampled.
+            if totals.minibatches > 0 && ppo.kl_stop.is_finite() && losses.kl.double_value(&[]) > ppo.kl_stop {
+                break 'passes;
+            }
             let loss = &losses.policy + &losses.value * ppo.value_coef - &losses.entropy * ppo.entropy_coef
                 + &losses.kl * schedule.kl_coef;
 

@@ -11,7 +11,6 @@ variants="quick
 batch --batch-steps 65536 --minibatch-steps 8192
 gamma --gamma 0.99
 lambda --gae-lambda 1.0
-clip --clip 0.3
 value --value-clip 10 --value-coef 1.0
 kl --kl-coef 0.2
 rate --learning-rate 5e-5
