@@ -222,12 +222,12 @@ impl Totals {
 
 #[cfg(test)]
 mod tests {
-    use popgym_models::Packing;
-    use popgym_models::distribution::Evaluation;
-    use tch::Tensor;
-
     use popgym_envs::space::Space;
     use popgym_envs::{Purpose, stream};
+    use popgym_models::distribution::Evaluation;
+    use popgym_models::{Packing, Policy};
+    use popgym_proto::Episode;
+    use tch::Tensor;
 
     use super::{Minibatch, Schedule, UpdateMeans, next_kl_coef, update};
     use crate::adam::{Adam, AdamOptions};
@@ -235,45 +235,68 @@ mod tests {
     use crate::config::Ppo;
     use crate::minibatches::Minibatches;
 
-    /// One epoch's losses at learning rate 0: 60 episodes of 1 to 12 steps, shifted by `first`, sampled with weights that are not the
-    /// policy's.
-    fn losses_at_rest(
+    /// 60 episodes of 1 to 12 steps, from number `first` on and around.
+    fn episodes(first: usize) -> Vec<Episode> {
+        let episode = |k: usize| {
+            let steps = 1 + k * 7 % 12;
+            let observations: Vec<u8> = (0..=steps).map(|t| ((k + t * t) % 3) as u8).collect();
+            let actions: Vec<u8> = (0..steps).map(|t| ((k + t) % 5 % 2) as u8).collect();
+            tests::episode(k as u64, &observations, &actions, k.is_multiple_of(4))
+        };
+        (0..60).map(|k| episode((k + first) % 60)).collect()
+    }
+
+    /// One epoch's update of a policy by episodes that one with `spread` times its weights has sampled.
+    fn updated(
         memory: &str,
-        first: usize,
-        minibatch_steps: i64,
-        minibatches: Minibatches,
-        seed: u64,
-    ) -> UpdateMeans {
+        (first, spread, learning_rate, seed): (usize, f64, f64, u64),
+        ppo: &Ppo,
+    ) -> (UpdateMeans, Policy) {
         let (policy, behaviour) = (tests::policy(memory, ""), tests::policy(memory, ""));
         tch::no_grad(|| {
             for weights in behaviour.parameters().values() {
-                let _ = weights.shallow_clone().g_mul_scalar_(1.8);
+                let _ = weights.shallow_clone().g_mul_scalar_(spread);
             }
         });
-        let episodes: Vec<_> = (0..60)
-            .map(|k| {
-                let k = (k + first) % 60;
-                let steps = 1 + k * 7 % 12;
-                let observations: Vec<u8> = (0..=steps).map(|t| ((k + t * t) % 3) as u8).collect();
-                let actions: Vec<u8> = (0..steps).map(|t| ((k + t) % 5 % 2) as u8).collect();
-                tests::episode(k as u64, &observations, &actions, k.is_multiple_of(4))
-            })
-            .collect();
-        let ppo = Ppo { minibatch_steps, minibatches, passes: 1, reward_scale: 0.1, ..Ppo::paper() };
-        let batch = Batch::new(&episodes, &Space::Discrete(2), &policy);
+        let ppo = Ppo { reward_scale: 0.1, ..ppo.clone() };
+        let batch = Batch::new(&episodes(first), &Space::Discrete(2), &policy);
         let old = batch.evaluate(&behaviour, &ppo);
         let options = AdamOptions { beta1: 0.9, beta2: 0.999, epsilon: 1e-8, max_grad_norm: 0.0 };
         let mut adam = Adam::new(policy.parameters(), options);
-        let schedule = Schedule { learning_rate: 0.0, kl_coef: 0.5 };
+        let schedule = Schedule { learning_rate, kl_coef: 0.5 };
         let mut rng = stream(seed, 0, 0, Purpose::Shuffle);
-        update(&policy, &mut adam, (&batch, &old), (&ppo, schedule), &mut rng, &|| false).unwrap()
+        let means = update(&policy, &mut adam, (&batch, &old), (&ppo, schedule), &mut rng, &|| false).unwrap();
+        (means, policy)
+    }
+
+    #[test]
+    fn passes_end_where_the_policy_has_moved_far_enough() {
+        // One minibatch a pass: at the first the policy is the one that sampled, at the second it has moved.
+        let passes = |passes: u32, kl_stop: f64| {
+            let ppo = Ppo { minibatch_steps: 1 << 20, passes, kl_stop, ..Ppo::paper() };
+            let (means, policy) = updated("gru", (0, 1.0, 1e-3, 0), &ppo);
+            (means.kl, policy.to_bytes())
+        };
+        let once = passes(1, f64::INFINITY);
+        let (kl, thrice) = passes(3, f64::INFINITY);
+        assert!(once.0.abs() < 1e-9 && kl > 1e-7 && thrice != once.1, "{kl}");
+        assert_eq!(passes(3, 1e-7).1, once.1);
+        assert_eq!(passes(3, 1.0).1, thrice);
+        // The first minibatch is always learned from, also if another version has sampled.
+        let ppo = Ppo { minibatch_steps: 1 << 20, passes: 3, kl_stop: 1e-7, ..Ppo::paper() };
+        let (means, _) = updated("gru", (0, 1.8, 1e-3, 0), &ppo);
+        assert!(means.kl > 1e-4, "{means:?}");
     }
 
     /// Neither the order of episodes and minibatches nor what shares a minibatch, and so a packing, changes what is lost.
     #[test]
     fn losses_are_those_of_the_episodes() {
         for memory in ["gru", "fart", "tcn"] {
-            let whole = losses_at_rest(memory, 0, 1 << 20, Minibatches::Shuffled, 0);
+            let losses = |first: usize, minibatch_steps: i64, minibatches: Minibatches, seed: u64| {
+                let ppo = Ppo { minibatch_steps, minibatches, passes: 1, ..Ppo::paper() };
+                updated(memory, (first, 1.8, 0.0, seed), &ppo).0
+            };
+            let whole = losses(0, 1 << 20, Minibatches::Shuffled, 0);
             assert!(whole.kl > 1e-4 && whole.value_loss > 0.1, "the policies differ: {whole:?}");
             for (first, minibatch_steps, minibatches, seed) in [
                 (0, 30, Minibatches::Shuffled, 0),
@@ -283,7 +306,7 @@ mod tests {
                 (17, 4, Minibatches::Shuffled, 2),
                 (41, 1 << 20, Minibatches::Fixed, 3),
             ] {
-                let parts = losses_at_rest(memory, first, minibatch_steps, minibatches, seed);
+                let parts = losses(first, minibatch_steps, minibatches, seed);
                 for (name, found, expected) in [
                     ("policy loss", parts.policy_loss, whole.policy_loss),
                     ("value loss", parts.value_loss, whole.value_loss),
