@@ -4,8 +4,9 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use toml::{Table, Value};
 
-/// Keys that change how a run is carried out or kept, but not what comes out of it.
-const INDIFFERENT: [&str; 4] = ["service.", "checkpoint_epochs", "keep_checkpoints", "threads"];
+/// Keys that change how a run is carried out or kept, but not what comes out of it. `threads` is none of them: sums are
+/// rounded differently with it, and the run takes another course.
+const INDIFFERENT: [&str; 3] = ["service.", "checkpoint_epochs", "keep_checkpoints"];
 
 /// The keys, such as `ppo.passes`, that not all of `configs` have the same value of.
 pub fn differing_keys(configs: &[&Table]) -> Vec<String> {
@@ -43,7 +44,7 @@ pub fn labels(configs: &[&Table], names: &[String]) -> Vec<String> {
 }
 
 /// Text without quotes and ids without their wrapping.
-fn bare(value: &Value) -> String {
+pub(super) fn bare(value: &Value) -> String {
     match value {
         Value::String(text) => text.trim_start_matches("popgym-").trim_end_matches("-v0").to_owned(),
         other => other.to_string(),
@@ -51,7 +52,7 @@ fn bare(value: &Value) -> String {
 }
 
 /// All values that are no tables, by their dotted keys.
-fn flat(table: &Table) -> BTreeMap<String, &Value> {
+pub(super) fn flat(table: &Table) -> BTreeMap<String, &Value> {
     let mut values = BTreeMap::new();
     for (key, value) in table {
         match value {
