@@ -169,7 +169,7 @@ mod tests {
         let root = tempfile::tempdir().unwrap();
         let runs = [("quick", "mlp", 0.0), ("quick", "gru", 0.5), ("paper", "mlp", 0.25), ("paper", "gru", 1.0)];
         for (preset, memory, score) in runs {
-            RunFiles { preset, memory, ..RunFiles::default() }
+            RunFiles { memory, preset, ..RunFiles::default() }
                 .write(&root.path().join(format!("{preset}-{memory}")), &[(70_000, 200, score)]);
         }
         let cells = cells(collected(&[root.path()]).unwrap().runs).unwrap();

@@ -43,10 +43,11 @@ pub fn labels(configs: &[&Table], names: &[String]) -> Vec<String> {
     labels.iter().zip(names).map(complete).collect()
 }
 
-/// Text without quotes and ids without their wrapping.
+/// Text without quotes, ids without their wrapping, and small numbers as 1e-8.
 pub(super) fn bare(value: &Value) -> String {
     match value {
         Value::String(text) => text.trim_start_matches("popgym-").trim_end_matches("-v0").to_owned(),
+        Value::Float(number) => format!("{number:?}"),
         other => other.to_string(),
     }
 }
@@ -86,6 +87,18 @@ mod tests {
             "env = 'popgym-RepeatFirstEasy-v0'\nseed = 2\n[ppo]\nclip = 0.2\npasses = 4\n[service]\nactors = 2",
         ]);
         assert_eq!(found, ["passes 3, seed 1", "passes 4, seed 2"]);
+    }
+
+    #[test]
+    fn numbers_are_short() {
+        let found = labelled(&["x = 0.00000001", "x = 0.3", "x = 10.0", "x = inf", "x = 3"]);
+        assert_eq!(found, ["x 1e-8", "x 0.3", "x 10.0", "x inf", "x 3"]);
+    }
+
+    #[test]
+    fn threads_count_but_not_how_often_is_saved() {
+        let found = labelled(&["threads = 1\ncheckpoint_epochs = 5", "threads = 2\ncheckpoint_epochs = 6"]);
+        assert_eq!(found, ["threads 1", "threads 2"]);
     }
 
     #[test]

@@ -57,7 +57,7 @@ pub fn make_names_plain<'a>(figures: impl Iterator<Item = &'a mut Figure>) {
 /// Whether a report writes figures of such names, and so may remove what an earlier one wrote.
 pub fn is_figure(file: &str) -> bool {
     let kinds = ["bars-", "curve-", "summary-", "paper-", "scores-", "throughput-"];
-    file.ends_with(".svg") && kinds.iter().any(|kind| file.starts_with(kind))
+    file.strip_suffix(".svg").is_some() && kinds.iter().any(|kind| file.starts_with(kind))
 }
 
 /// As much of `title` as there is room for above a figure.
@@ -127,7 +127,9 @@ mod tests {
 
     #[test]
     fn names_are_plain_short_and_different() {
-        let figure = |name: &str| Figure { name: name.into(), title: "".into(), caption: "".into(), svg: "".into() };
+        let [title, caption, svg] = [""; 3].map(str::to_owned);
+        let figure =
+            |name: &str| Figure { name: name.into(), title: title.clone(), caption: caption.clone(), svg: svg.clone() };
         let mut figures = ["a-1, x 0.5", "a-1_ x 0_5", &"b".repeat(500)].map(figure);
         make_names_plain(figures.iter_mut());
         let names: Vec<&str> = figures.iter().map(|figure| figure.name.as_str()).collect();
