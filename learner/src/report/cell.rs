@@ -3,12 +3,13 @@
 use super::labels::differing_keys;
 use super::paper::{self, Paper, Score};
 use super::run::{Run, Task};
+use super::text::plural;
 use crate::statistics::Sample;
 
 /// A place in the table: one memory on one task.
 #[derive(Clone, Debug)]
 pub struct Cell {
-    /// Environment and preset.
+    /// Environment and hyper-parameters.
     pub task: Task,
     /// Name of the memory.
     pub memory: String,
@@ -22,7 +23,8 @@ pub struct Cell {
     pub mmer_65k: Option<Sample>,
     /// The paper's figure, if it has one.
     pub paper: Option<Score>,
-    /// How `mmer_65k` stands to the paper's figure, if there are both.
+    /// How `mmer_65k` stands to the paper's figure, if every run has its part in both: none stopped early, none is without a
+    /// block.
     pub verdict: Option<Verdict>,
     /// What else must be known to read the figures.
     pub notes: Vec<String>,
@@ -33,8 +35,8 @@ pub struct Cell {
 pub struct Verdict {
     /// Ours minus the paper's.
     pub difference: f64,
-    /// Two standard errors of the difference: `2 sqrt(s1^2 / n1 + s2^2 / n2)`. With one seed of ours only the paper's error
-    /// is known.
+    /// Two standard errors of the difference, `2 sqrt(s1^2 / n1 + s2^2 / n2)`, and the half unit by which the paper rounds.
+    /// With one seed of ours only the paper's error is known.
     pub bound: f64,
     /// Whether the error of ours is part of the bound.
     pub both_errors: bool,
@@ -47,31 +49,37 @@ impl Verdict {
         let own = ours.std.map(|std| square(std, ours.n));
         Self {
             difference: ours.mean - score.mean,
-            bound: 2.0 * (own.unwrap_or(0.0) + square(score.std, paper::TRIALS)).sqrt(),
+            bound: 2.0 * (own.unwrap_or(0.0) + square(score.std, paper::TRIALS)).sqrt() + paper::ROUNDING,
             both_errors: own.is_some(),
         }
     }
 
-    /// Whether the difference is within two standard errors, and the half unit by which the paper rounds.
+    /// Whether the difference is within the bound.
     pub fn within(&self) -> bool {
-        self.difference.abs() <= self.bound + paper::ROUNDING
+        self.difference.abs() <= self.bound
     }
 }
 
 impl Cell {
     /// The smallest and the largest of the runs' step budgets.
     pub fn budgets(&self) -> (u64, u64) {
-        extremes(self.runs.iter().map(|run| run.budget))
+        least_and_most(self.runs.iter().map(|run| run.budget))
     }
 
     /// The smallest and the largest number of steps that a run has done.
     pub fn steps(&self) -> (u64, u64) {
-        extremes(self.runs.iter().map(|run| run.steps))
+        least_and_most(self.runs.iter().map(|run| run.steps))
     }
 
     /// How many runs ended before their budget because their MMER was high enough.
     pub fn stopped_early(&self) -> usize {
         self.runs.iter().filter(|run| run.stopped_early()).count()
+    }
+
+    /// Whether `mmer_65k` only says what the memory can do at least: what a run does just before it stops at its target is
+    /// mostly not in a complete block.
+    pub fn lower_bound(&self) -> bool {
+        self.stopped_early() > 0
     }
 
     /// Environment steps of the paper's runs, if the paper has this cell.
@@ -81,13 +89,25 @@ impl Cell {
 
     /// Why the paper's figure is of something else, if it is.
     pub fn marks(&self) -> Vec<&'static str> {
-        let game = self.task.paper_game.as_deref().and_then(paper::game_mark);
-        self.paper.iter().flat_map(|_| paper::memory_mark(&self.paper_memory).into_iter().chain(game)).collect()
+        self.memory_mark().into_iter().chain(self.game_mark()).collect()
     }
 
-    /// The memory's name with an asterisk for each mark.
+    /// The memory's name, with an asterisk if the paper's figure is of another model.
     pub fn marked_memory(&self) -> String {
-        format!("{}{}", self.paper_memory, "*".repeat(self.marks().len()))
+        paper::marked(&self.paper_memory, self.memory_mark())
+    }
+
+    /// The environment's name, with an asterisk if the paper's figure is of other rules.
+    pub fn marked_env(&self) -> String {
+        paper::marked(&self.task.env, self.game_mark())
+    }
+
+    fn memory_mark(&self) -> Option<&'static str> {
+        self.paper.and_then(|_| paper::memory_mark(&self.paper_memory))
+    }
+
+    fn game_mark(&self) -> Option<&'static str> {
+        self.paper.and_then(|_| paper::game_mark(self.task.paper_game.as_deref()?))
     }
 
     fn new(runs: Vec<Run>, paper: &Paper) -> Option<Self> {
@@ -97,12 +117,15 @@ impl Cell {
         let score = first.task.paper_game.as_deref().zip(first.task.difficulty);
         let score = score.and_then(|(game, level)| paper.score(game, level, &first.paper_memory));
         let mmer_65k = Sample::of(&blocks);
+        // Of runs that stop at a target, only the slow ones have many blocks, or any.
+        let comparable = blocks.len() == runs.len() && !runs.iter().any(Run::stopped_early);
+        let pair = mmer_65k.as_ref().zip(score.as_ref()).filter(|_| comparable);
         Some(Self {
             mmer: Sample::of(&values)?,
             mmer_65k,
             paper: score,
-            verdict: mmer_65k.as_ref().zip(score.as_ref()).map(|(ours, score)| Verdict::new(ours, score)),
-            notes: notes(&runs, score.is_some()),
+            verdict: pair.map(|(ours, score)| Verdict::new(ours, score)),
+            notes: notes(&first.task, &runs, score.is_some()),
             task: first.task,
             memory: first.memory,
             paper_memory: first.paper_memory,
@@ -112,7 +135,7 @@ impl Cell {
 }
 
 /// What the figures alone do not tell.
-fn notes(runs: &[Run], in_paper: bool) -> Vec<String> {
+fn notes(task: &Task, runs: &[Run], in_paper: bool) -> Vec<String> {
     let (n, mut notes) = (runs.len(), Vec::new());
     let mut count = |number: usize, text: &str| {
         if number > 0 {
@@ -120,8 +143,14 @@ fn notes(runs: &[Run], in_paper: bool) -> Vec<String> {
         }
     };
     count(runs.iter().filter(|run| !run.complete()).count(), "not finished");
-    count(runs.iter().filter(|run| run.stopped_early()).count(), "stopped early at its target, so MMER may be too low");
+    count(
+        runs.iter().filter(|run| run.stopped_early()).count(),
+        "stopped early at its target, so MMER and MMER-65k are lower bounds",
+    );
     count(runs.iter().filter(|run| run.mmer_65k.is_none()).count(), "without a block of 65,536 steps");
+    if let Some(steps) = task.cut_after {
+        notes.push(format!("not the benchmark's task: episodes are cut after {steps} steps"));
+    }
     if n == 1 {
         notes.push(if in_paper { "one seed: only the paper's error is known" } else { "one seed" }.to_owned());
     }
@@ -152,8 +181,27 @@ pub fn cells(runs: Vec<Run>) -> anyhow::Result<Vec<Cell>> {
     Ok(groups.into_iter().filter_map(|group| Cell::new(group, &paper)).collect())
 }
 
-fn extremes(values: impl Iterator<Item = u64> + Clone) -> (u64, u64) {
-    (values.clone().min().unwrap_or(0), values.max().unwrap_or(0))
+/// The smallest and the largest number of seeds of `cells`, in words.
+pub fn seeds<'a>(cells: impl IntoIterator<Item = &'a Cell>) -> String {
+    match least_and_most(cells.into_iter().map(|cell| cell.runs.len() as u64)) {
+        (fewest, most) if fewest == most => plural(most as usize, "seed"),
+        (fewest, most) => format!("{fewest} to {most} seeds"),
+    }
+}
+
+/// The smallest and the largest number of steps that a run of `cells` has done.
+pub fn steps<'a>(cells: impl IntoIterator<Item = &'a Cell>) -> (u64, u64) {
+    least_and_most(cells.into_iter().flat_map(|cell| &cell.runs).map(|run| run.steps))
+}
+
+/// The smallest and the largest of the step budgets of `cells`.
+pub fn budgets<'a>(cells: impl IntoIterator<Item = &'a Cell>) -> (u64, u64) {
+    least_and_most(cells.into_iter().flat_map(|cell| &cell.runs).map(|run| run.budget))
+}
+
+fn least_and_most(values: impl Iterator<Item = u64>) -> (u64, u64) {
+    let joined = values.fold((u64::MAX, 0), |(least, most), value| (least.min(value), most.max(value)));
+    if joined.0 > joined.1 { (0, 0) } else { joined }
 }
 
 #[cfg(test)]
@@ -183,42 +231,72 @@ mod tests {
     #[test]
     fn verdict_is_by_two_standard_errors_of_both() {
         let ours = Sample { n: 2, mean: 0.5, std: Some(0.1) };
-        // 2 sqrt(0.01 / 2 + 0.0012 / 3) = 2 sqrt(0.0054) = 0.14697.
+        // 2 sqrt(0.01 / 2 + 0.0012 / 3) = 2 sqrt(0.0054) = 0.14697, and half a unit of the third place.
         let verdict = |mean: f64| Verdict::new(&ours, &Score { mean, std: 0.0012_f64.sqrt() });
-        assert!((verdict(0.4).bound - 0.146_969_384_566_99).abs() < 1e-12);
+        assert!((verdict(0.4).bound - 0.147_469_384_566_99).abs() < 1e-12);
         assert!(verdict(0.4).within() && verdict(0.64).within() && verdict(0.4).both_errors);
         assert!(!verdict(0.35).within() && !verdict(0.65).within());
         assert!((verdict(0.35).difference - 0.15).abs() < 1e-12);
-        // Of one seed: 2 sqrt(0.0012 / 3) = 0.04.
+        // Of one seed: 2 sqrt(0.0012 / 3) = 0.04, and again 0.0005.
         let one = Verdict::new(&Sample { n: 1, mean: 0.5, std: None }, &Score { mean: 0.45, std: 0.0012_f64.sqrt() });
-        assert!((one.bound - 0.04).abs() < 1e-12 && !one.both_errors && !one.within());
+        assert!((one.bound - 0.0405).abs() < 1e-12 && !one.both_errors && !one.within());
         // The paper's 1.000 may be 0.9995.
         let exact = |mean| Verdict::new(&Sample { n: 1, mean, std: None }, &Score { mean: 1.0, std: 0.0 });
         assert!(exact(0.9996).within() && !exact(0.9994).within());
+        assert!((exact(1.0).bound - 0.0005).abs() < 1e-12);
     }
 
     #[test]
     fn what_must_be_known_is_noted() {
         let root = tempfile::tempdir().unwrap();
         let short = [(60_000, 200, 0.96)];
-        RunFiles { stopped_by: "mmer", ..RunFiles::default() }.write(&root.path().join("0"), &short);
-        RunFiles { seed: 1, stopped_by: "", ..RunFiles::default() }
+        let budget = Some(1_000_000);
+        RunFiles { stopped_by: "mmer", budget, ..RunFiles::default() }.write(&root.path().join("0"), &short);
+        RunFiles { seed: 1, stopped_by: "", budget, ..RunFiles::default() }
             .write(&root.path().join("1"), &[(70_000, 200, 0.5)]);
-        RunFiles { seed: 2, budget: 80_000, ..RunFiles::default() }
-            .write(&root.path().join("2"), &[(80_000, 200, 0.7)]);
+        RunFiles { seed: 2, ..RunFiles::default() }.write(&root.path().join("2"), &[(80_000, 200, 0.7)]);
         let cells = cells(collected(&[root.path()]).unwrap().runs).unwrap();
         assert_eq!(
             cells[0].notes,
             [
                 "1 of 3 not finished",
-                "1 of 3 stopped early at its target, so MMER may be too low",
+                "1 of 3 stopped early at its target, so MMER and MMER-65k are lower bounds",
                 "1 of 3 without a block of 65,536 steps",
-                "the seeds differ in steps",
+                "the seeds differ in steps, stop_at_mmer",
             ]
         );
         assert_eq!((cells[0].budgets(), cells[0].steps()), ((80_000, 1_000_000), (60_000, 80_000)));
         assert_eq!(cells[0].stopped_early(), 1);
         assert!((cells[0].mmer_65k.unwrap().mean - 0.6).abs() < 1e-12);
         assert_eq!(cells[0].mmer_65k.unwrap().n, 2);
+        assert_eq!((cells[0].verdict, cells[0].lower_bound()), (None, true));
+    }
+
+    #[test]
+    fn no_verdict_where_the_good_part_of_a_run_does_not_count() {
+        let verdict = |files: RunFiles<'_>, epochs: &[(u64, u64, f64)]| {
+            let root = tempfile::tempdir().unwrap();
+            files.write(&root.path().join("0"), epochs);
+            RunFiles { seed: 1, ..RunFiles::default() }.write(&root.path().join("1"), &[(70_000, 200, 0.5)]);
+            let cells = cells(collected(&[root.path()]).unwrap().runs).unwrap();
+            assert!(cells[0].mmer_65k.is_some() && cells[0].paper.is_some());
+            cells[0].verdict.is_some()
+        };
+        assert!(verdict(RunFiles::default(), &[(70_000, 200, 0.5)]));
+        // It mastered the task after its only complete block: MMER 0.98, MMER-65k 0.5.
+        let stopped = || RunFiles { stopped_by: "mmer", budget: Some(1_000_000), ..RunFiles::default() };
+        assert!(!verdict(stopped(), &[(70_000, 200, 0.5), (60_000, 200, 0.98)]));
+        assert!(!verdict(stopped(), &[(60_000, 200, 0.98)]));
+        // No block at all, for want of steps.
+        assert!(!verdict(RunFiles::default(), &[(60_000, 200, 0.5)]));
+    }
+
+    #[test]
+    fn shorter_episodes_are_not_set_beside_the_paper() {
+        let root = tempfile::tempdir().unwrap();
+        RunFiles { keys: "max_episode_steps = 20\n", ..RunFiles::default() }.write(root.path(), &[(70_000, 200, 0.5)]);
+        let cells = cells(collected(&[root.path()]).unwrap().runs).unwrap();
+        assert_eq!((cells[0].paper, cells[0].verdict), (None, None));
+        assert_eq!(cells[0].notes, ["not the benchmark's task: episodes are cut after 20 steps", "one seed"]);
     }
 }

@@ -1,6 +1,7 @@
 //! Which memories can be compared over which environments: only those that all of them have.
 
 use super::cell::Cell;
+use super::paper::{marked, memory_mark};
 use super::text::plural;
 use crate::statistics::{mean, spearman};
 
@@ -10,8 +11,10 @@ const LABYRINTHS: &str = "navigation";
 /// At most so many sets of memories are compared: the largest.
 const MOST: usize = 3;
 
-/// Memories, and the tasks that every one of them has.
+/// Memories, and the tasks of one preset that every one of them has.
 pub struct Compared<'a> {
+    /// The runs' preset, and what was changed of it.
+    pub preset: String,
     /// The memories, by their names in the paper, in the paper's order.
     pub memories: Vec<String>,
     /// For each task, the cells of the memories, in the same order.
@@ -25,29 +28,31 @@ pub struct Scores {
     pub memory: String,
     /// MMER, over all tasks.
     pub mmer: Option<f64>,
-    /// Best blocks, over those tasks in which all memories have one and the paper has figures.
+    /// Best blocks, over those tasks in which all memories can be set beside the paper.
     pub mmer_65k: Option<f64>,
     /// The paper's MMER over the same tasks.
     pub paper: Option<f64>,
 }
 
 impl<'a> Compared<'a> {
-    /// The comparisons that `cells` allow: for each set of two memories or more that some task has, over all tasks that
-    /// have at least these. Large tables first.
+    /// The comparisons that `cells` allow: for each set of two memories or more that some task has, over all tasks of
+    /// the same preset that have at least these. Large tables first.
     pub fn all(cells: &'a [Cell]) -> Vec<Self> {
         let tasks: Vec<&[Cell]> = cells.chunk_by(|a, b| a.task.key() == b.task.key()).collect();
         let mut found: Vec<Self> = Vec::new();
         for task in &tasks {
             let memories: Vec<String> = task.iter().map(|cell| cell.paper_memory.clone()).collect();
-            if memories.len() < 2 || found.iter().any(|other| other.memories == memories) {
+            let preset = &task[0].task.preset;
+            if memories.len() < 2 || found.iter().any(|other| other.preset == *preset && other.memories == memories) {
                 continue;
             }
-            let tasks = tasks.iter().filter_map(|task| {
+            let same = tasks.iter().filter(|task| task[0].task.preset == *preset);
+            let tasks = same.filter_map(|task| {
                 let cell = |name: &String| task.iter().find(|cell| cell.paper_memory == *name);
                 memories.iter().map(cell).collect::<Option<Vec<_>>>()
             });
             let tasks = tasks.collect();
-            found.push(Self { memories, tasks });
+            found.push(Self { preset: preset.clone(), memories, tasks });
         }
         found.sort_by_key(|compared| std::cmp::Reverse(compared.memories.len() * compared.tasks.len()));
         found.truncate(MOST);
@@ -58,10 +63,10 @@ impl<'a> Compared<'a> {
     pub fn without_labyrinths(&self) -> Option<Self> {
         let tasks: Vec<_> = self.tasks.iter().filter(|task| task[0].task.group != LABYRINTHS).cloned().collect();
         let some = !tasks.is_empty() && tasks.len() < self.tasks.len();
-        some.then(|| Self { memories: self.memories.clone(), tasks })
+        some.then(|| Self { preset: self.preset.clone(), memories: self.memories.clone(), tasks })
     }
 
-    /// How many tasks have a best block of every memory, and the paper's figures.
+    /// In how many tasks all memories can be set beside the paper.
     pub fn beside_paper(&self) -> usize {
         self.tasks.iter().filter(|task| beside_paper(task)).count()
     }
@@ -85,10 +90,14 @@ impl<'a> Compared<'a> {
 
     /// Rank correlation over the memories between our scores (best blocks) and the paper's.
     pub fn rank_correlation(&self) -> Option<f64> {
+        correlation(self.scores().iter())
+    }
+
+    /// The same without the memories of which the paper's figures are of another model; none if there are no such memories.
+    pub fn unmarked_rank_correlation(&self) -> Option<f64> {
         let scores = self.scores();
-        let ours: Vec<f64> = scores.iter().filter_map(|score| score.mmer_65k).collect();
-        let paper: Vec<f64> = scores.iter().filter_map(|score| score.paper).collect();
-        spearman(&ours, &paper)
+        let unmarked: Vec<&Scores> = scores.iter().filter(|score| memory_mark(&score.memory).is_none()).collect();
+        correlation(unmarked.iter().copied()).filter(|_| unmarked.len() < scores.len())
     }
 
     /// Each memory's standardised MMER in every task.
@@ -99,29 +108,35 @@ impl<'a> Compared<'a> {
 
     /// What is compared, in words.
     pub fn title(&self) -> String {
-        format!("{} memories over {}", self.memories.len(), plural(self.tasks.len(), "environment"))
+        format!("{} memories over {}, {}", self.memories.len(), plural(self.tasks.len(), "environment"), self.preset)
     }
 
-    /// Smallest and largest number of seeds of a cell.
-    pub fn seeds(&self) -> (usize, usize) {
-        let seeds = || self.tasks.iter().flatten().map(|cell| cell.runs.len());
-        (seeds().min().unwrap_or(0), seeds().max().unwrap_or(0))
-    }
-
-    /// Smallest and largest number of environment steps of a run.
-    pub fn steps(&self) -> (u64, u64) {
-        let steps = || self.tasks.iter().flatten().map(|cell| cell.steps());
-        (steps().map(|steps| steps.0).min().unwrap_or(0), steps().map(|steps| steps.1).max().unwrap_or(0))
+    /// All cells.
+    pub fn cells(&self) -> impl Iterator<Item = &'a Cell> {
+        self.tasks.iter().flatten().copied()
     }
 }
 
+impl Scores {
+    /// The memory, with an asterisk if the paper's figures are of another model.
+    pub fn marked_memory(&self) -> String {
+        marked(&self.memory, memory_mark(&self.memory))
+    }
+}
+
+fn correlation<'a>(scores: impl Iterator<Item = &'a Scores>) -> Option<f64> {
+    let (ours, paper): (Vec<f64>, Vec<f64>) = scores.filter_map(|score| score.mmer_65k.zip(score.paper)).unzip();
+    spearman(&ours, &paper)
+}
+
 fn beside_paper(task: &[&Cell]) -> bool {
-    task.iter().all(|cell| cell.mmer_65k.is_some() && cell.paper.is_some())
+    task.iter().all(|cell| cell.verdict.is_some())
 }
 
 #[cfg(test)]
 mod tests {
-    use super::super::samples::cells_of;
+    use super::super::cell::cells;
+    use super::super::samples::{RunFiles, cells_of, collected};
     use super::*;
 
     #[test]
@@ -138,7 +153,7 @@ mod tests {
         ]);
         let all = Compared::all(&cells);
         let titles: Vec<_> = all.iter().map(Compared::title).collect();
-        assert_eq!(titles, ["2 memories over 3 environments", "3 memories over 1 environment"]);
+        assert_eq!(titles, ["2 memories over 3 environments, quick", "3 memories over 1 environment, quick"]);
         assert_eq!(all[0].memories, ["MLP", "GRU"]);
         let means: Vec<_> = all[0].scores().iter().map(|score| score.mmer.unwrap()).collect();
         assert_eq!(means, [0.0, 0.25]);
@@ -147,5 +162,39 @@ mod tests {
         assert_eq!((fewer.tasks.len(), fewer.beside_paper(), means), (2, 2, vec![-0.375, 0.75]));
         assert!(all[1].without_labyrinths().is_none(), "there are none in it");
         assert_eq!(all[1].standardised()[2], ("LSTM".to_owned(), vec![0.75]));
+    }
+
+    #[test]
+    fn presets_are_compared_apart() {
+        let root = tempfile::tempdir().unwrap();
+        let runs = [("quick", "mlp", 0.0), ("quick", "gru", 0.5), ("paper", "mlp", 0.25), ("paper", "gru", 1.0)];
+        for (preset, memory, score) in runs {
+            RunFiles { memory, preset, ..RunFiles::default() }
+                .write(&root.path().join(format!("{preset}-{memory}")), &[(70_000, 200, score)]);
+        }
+        let cells = cells(collected(&[root.path()]).unwrap().runs).unwrap();
+        let all = Compared::all(&cells);
+        let means = |compared: &Compared<'_>| -> Vec<f64> { compared.scores().iter().filter_map(|s| s.mmer).collect() };
+        let found: Vec<_> = all.iter().map(|compared| (compared.title(), means(compared))).collect();
+        let title = |preset: &str| format!("2 memories over 1 environment, {preset}");
+        assert_eq!(found, [(title("paper"), vec![0.25, 1.0]), (title("quick"), vec![0.0, 0.5])]);
+    }
+
+    #[test]
+    fn rank_correlation_with_and_without_marked_memories() {
+        // In the paper's AutoencodeEasy MLP has -0.470, LSTM -0.312, GRU -0.283; FART is marked.
+        let cells = cells_of(&[
+            ("AutoencodeEasy", "mlp", &[0.1]),
+            ("AutoencodeEasy", "fart", &[-0.9]),
+            ("AutoencodeEasy", "gru", &[0.3]),
+            ("AutoencodeEasy", "lstm", &[0.2]),
+        ]);
+        let compared = &Compared::all(&cells)[0];
+        assert_eq!(compared.unmarked_rank_correlation(), Some(1.0));
+        assert!(compared.rank_correlation().unwrap() < 1.0);
+        let names: Vec<String> = compared.scores().iter().map(Scores::marked_memory).collect();
+        assert_eq!(names, ["MLP", "FART*", "GRU", "LSTM"]);
+        let cells = cells_of(&[("AutoencodeEasy", "mlp", &[0.1]), ("AutoencodeEasy", "gru", &[0.3])]);
+        assert_eq!(Compared::all(&cells)[0].unmarked_rank_correlation(), None, "none of them is marked");
     }
 }

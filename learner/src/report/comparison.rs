@@ -170,7 +170,9 @@ fn curve(dir: &Path, config: &Table, label: String, notes: &mut Vec<String>) -> 
         notes.push(format!("{}: no wall time: {error:#}", dir.display()));
         Vec::new()
     });
-    let seconds = |epoch: u64| timing.iter().find(|row| row.epoch == epoch).map(|row| row.wall_seconds);
+    // A damaged file may hold any number.
+    let times = || timing.iter().filter(|row| row.wall_seconds.is_finite() && row.wall_seconds >= 0.0);
+    let seconds = |epoch: u64| times().find(|row| row.epoch == epoch).map(|row| row.wall_seconds);
     Ok(Curve {
         label,
         env: config.get("env").and_then(Value::as_str).unwrap_or_default().to_owned(),
@@ -198,8 +200,9 @@ mod tests {
         let root = tempfile::tempdir().unwrap();
         let dirs = [root.path().join("a"), root.path().join("b")];
         let epochs = [(1000, 10, -0.5), (1000, 10, 0.0), (1000, 10, 0.5)];
-        RunFiles::default().write(&dirs[0], &epochs);
-        RunFiles { memory: "mlp", ..RunFiles::default() }.write(&dirs[1], &epochs[..2]);
+        let budget = Some(2000);
+        RunFiles { budget, ..RunFiles::default() }.write(&dirs[0], &epochs);
+        RunFiles { memory: "mlp", budget, ..RunFiles::default() }.write(&dirs[1], &epochs[..2]);
         let found = Comparison::read(&dirs).unwrap();
         assert!(found.notes.is_empty(), "{:?}", found.notes);
         // From -0.5 to 0.5, in tenths, rounded down: -0.25, 0, 0.25, 0.45.
@@ -216,11 +219,31 @@ mod tests {
     }
 
     #[test]
+    fn times_that_are_no_numbers_are_left_out() {
+        let root = tempfile::tempdir().unwrap();
+        let dirs = [root.path().join("a"), root.path().join("b")];
+        for (seed, dir) in dirs.iter().enumerate() {
+            RunFiles { seed: seed as u64, ..RunFiles::default() }.write(dir, &[(1000, 10, 0.0), (1000, 10, 0.5)]);
+        }
+        let path = dirs[0].join("timing.csv");
+        let text = fs::read_to_string(&path).unwrap();
+        // The second epoch ends after two seconds.
+        let damaged = text.replace(",2000,2.0,", ",2000,inf,");
+        assert_ne!(damaged, text);
+        fs::write(&path, damaged).unwrap();
+        let found = Comparison::read(&dirs).unwrap();
+        assert_eq!(found.curves[0].by_seconds, [(1.0, 0.0)]);
+        assert_eq!(found.curves[1].by_seconds, [(1.0, 0.0), (2.0, 0.5)]);
+        assert!(found.svg().is_ok());
+    }
+
+    #[test]
     fn other_environments_and_missing_times_are_said() {
         let root = tempfile::tempdir().unwrap();
         let dirs = [root.path().join("a"), root.path().join("b")];
-        RunFiles::default().write(&dirs[0], &[(1000, 10, 0.0), (1000, 10, 0.5)]);
-        RunFiles { env: "BattleshipEasy", ..RunFiles::default() }.write(&dirs[1], &[(1000, 10, 0.5)]);
+        let budget = Some(1000);
+        RunFiles { budget, ..RunFiles::default() }.write(&dirs[0], &[(1000, 10, 0.0), (1000, 10, 0.5)]);
+        RunFiles { env: "BattleshipEasy", budget, ..RunFiles::default() }.write(&dirs[1], &[(1000, 10, 0.5)]);
         fs::remove_file(dirs[0].join("timing.csv")).unwrap();
         let found = Comparison::read(&dirs).unwrap();
         assert!(found.notes[0].contains("no wall time") && found.notes[1].contains("different environments"));

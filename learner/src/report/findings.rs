@@ -1,16 +1,19 @@
 //! What agrees with the paper and what does not, from the figures alone.
 
 use super::cell::Cell;
+use super::paper::memory_mark;
 use crate::statistics::spearman;
 
 /// A task on which several memories can be compared, here and in the paper.
 pub struct Ranking<'a> {
-    /// The memories' cells; each has a best block and a figure of the paper.
+    /// The memories' cells; each has a verdict.
     pub cells: Vec<&'a Cell>,
-    /// How many more memories have runs here, but no such block or figure.
+    /// How many more memories have runs here, but no verdict.
     pub missing: usize,
     /// Rank correlation over the memories; none of fewer than three.
     pub correlation: Option<f64>,
+    /// The same without memories of which the paper's figure is of another model.
+    pub unmarked_correlation: Option<f64>,
 }
 
 /// How the cells stand to the paper.
@@ -22,7 +25,9 @@ pub struct Agreement {
     pub higher: usize,
     /// Below them.
     pub lower: usize,
-    /// Without a best block, or without a figure of the paper.
+    /// Not compared, because a run stopped at its target.
+    pub lower_bounds: usize,
+    /// Not compared, because a run has no block, or the paper no figure.
     pub unknown: usize,
 }
 
@@ -32,6 +37,7 @@ impl Agreement {
         let mut counts = Self::default();
         for cell in cells {
             *match cell.verdict {
+                None if cell.paper.is_some() && cell.lower_bound() => &mut counts.lower_bounds,
                 None => &mut counts.unknown,
                 Some(verdict) if verdict.within() => &mut counts.within,
                 Some(verdict) if verdict.difference > 0.0 => &mut counts.higher,
@@ -48,37 +54,39 @@ impl Agreement {
 }
 
 impl<'a> Ranking<'a> {
-    /// The tasks on which at least two memories can be compared.
+    /// The tasks on which at least two memories can be compared. Where a run stopped at its target nobody knows who would have
+    /// won.
     pub fn all(cells: &'a [Cell]) -> Vec<Self> {
         let tasks = cells.chunk_by(|a, b| a.task.key() == b.task.key());
         let ranking = |task: &'a [Cell]| {
             let cells: Vec<&Cell> = task.iter().filter(|cell| cell.verdict.is_some()).collect();
-            let ours: Vec<f64> = cells.iter().filter_map(|cell| ours(cell)).collect();
-            let paper: Vec<f64> = cells.iter().filter_map(|cell| paper(cell)).collect();
+            let unmarked = cells.iter().copied().filter(|cell| memory_mark(&cell.paper_memory).is_none());
+            let (correlation, unmarked_correlation) = (correlation(cells.iter().copied()), correlation(unmarked));
             let missing = task.len() - cells.len();
-            (cells.len() > 1).then(|| Self { missing, correlation: spearman(&ours, &paper), cells })
+            let fair = cells.len() > 1 && !task.iter().any(Cell::lower_bound);
+            fair.then_some(Self { cells, missing, correlation, unmarked_correlation })
         };
         tasks.filter_map(ranking).collect()
     }
 
-    /// The best memory here; the first of equals.
+    /// The best memory here; of equals the one that is better in the paper, then the first.
     pub fn winner(&self) -> &'a Cell {
-        self.best(ours)
+        self.best(|cell| (ours(cell), paper(cell)))
     }
 
-    /// The best of these memories in the paper; the first of equals.
+    /// The best of these memories in the paper; of equals the one that is better here, then the first.
     pub fn paper_winner(&self) -> &'a Cell {
-        self.best(paper)
+        self.best(|cell| (paper(cell), ours(cell)))
     }
 
-    fn best(&self, value: fn(&Cell) -> Option<f64>) -> &'a Cell {
+    fn best(&self, value: fn(&Cell) -> (Option<f64>, Option<f64>)) -> &'a Cell {
         let better = |a: &'a Cell, b: &'a Cell| if value(b) > value(a) { b } else { a };
         self.cells[1..].iter().fold(self.cells[0], |a, b| better(a, b))
     }
 
-    /// Whether the memory that is best here is among the best in the paper, where several may print the same figure.
+    /// Whether some memory is best both here and in the paper, alone or among equals: then it is both winners.
     pub fn agrees(&self) -> bool {
-        paper(self.winner()) >= paper(self.paper_winner())
+        paper(self.winner()) == paper(self.paper_winner())
     }
 }
 
@@ -89,6 +97,12 @@ pub fn largest_differences(cells: &[Cell], most: usize) -> Vec<&Cell> {
     found.sort_by(|a, b| size(b).total_cmp(&size(a)));
     found.truncate(most);
     found
+}
+
+/// Rank correlation over `cells` between our best blocks and the paper's figures.
+fn correlation<'a>(cells: impl Iterator<Item = &'a Cell>) -> Option<f64> {
+    let (ours, paper): (Vec<f64>, Vec<f64>) = cells.filter_map(|cell| ours(cell).zip(paper(cell))).unzip();
+    spearman(&ours, &paper)
 }
 
 fn ours(cell: &Cell) -> Option<f64> {
@@ -126,6 +140,40 @@ mod tests {
         assert_eq!((ranking.winner().memory.as_str(), ranking.paper_winner().memory.as_str()), ("lstm", "gru"));
         // Ranks 1 2 3 and 1 3 2: 1 - 6 * 2 / (3 * 8).
         assert!((ranking.correlation.unwrap() - 0.5).abs() < 1e-12 && !ranking.agrees() && ranking.missing == 0);
+    }
+
+    #[test]
+    fn of_equals_any_counts() {
+        // In the paper's AutoencodeEasy GRU has -0.283, LSTM -0.312: GRU is the one that both agree on.
+        let cells = cells_of(&[("AutoencodeEasy", "lstm", &[0.5]), ("AutoencodeEasy", "gru", &[0.5])]);
+        let rankings = Ranking::all(&cells);
+        let names = |ranking: &Ranking<'_>| (ranking.winner().memory.clone(), ranking.paper_winner().memory.clone());
+        assert_eq!((names(&rankings[0]), rankings[0].agrees()), (("gru".into(), "gru".into()), true));
+    }
+
+    #[test]
+    fn marked_memories_can_be_left_out() {
+        // The paper: MLP -0.470, GRU -0.283, LSTM -0.312, and FART.
+        let cells = cells_of(&[
+            ("AutoencodeEasy", "mlp", &[0.1]),
+            ("AutoencodeEasy", "fart", &[-0.9]),
+            ("AutoencodeEasy", "gru", &[0.3]),
+            ("AutoencodeEasy", "lstm", &[0.2]),
+        ]);
+        let ranking = &Ranking::all(&cells)[0];
+        assert_eq!((ranking.unmarked_correlation, ranking.cells.len()), (Some(1.0), 4));
+        assert!(ranking.correlation.unwrap() < 1.0);
+    }
+
+    #[test]
+    fn nobody_wins_where_a_run_stopped_at_its_target() {
+        let mut cells = cells();
+        cells[0].runs[0].stopped_by = Some("mmer".into());
+        cells[0].runs[0].budget = 1_000_000;
+        cells[0].verdict = None;
+        assert_eq!(Ranking::all(&cells).len(), 0);
+        let agreement = Agreement::of(cells.iter());
+        assert_eq!((agreement.lower_bounds, agreement.unknown, agreement.compared()), (1, 2, 2));
     }
 
     #[test]

@@ -4,8 +4,9 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use toml::{Table, Value};
 
-/// Keys that change how a run is carried out or kept, but not what comes out of it.
-const INDIFFERENT: [&str; 4] = ["service.", "checkpoint_epochs", "keep_checkpoints", "threads"];
+/// Keys that change how a run is carried out or kept, but not what comes out of it. `threads` is none of them: sums are
+/// rounded differently with it, and the run takes another course.
+const INDIFFERENT: [&str; 3] = ["service.", "checkpoint_epochs", "keep_checkpoints"];
 
 /// The keys, such as `ppo.passes`, that not all of `configs` have the same value of.
 pub fn differing_keys(configs: &[&Table]) -> Vec<String> {
@@ -42,16 +43,17 @@ pub fn labels(configs: &[&Table], names: &[String]) -> Vec<String> {
     labels.iter().zip(names).map(complete).collect()
 }
 
-/// Text without quotes and ids without their wrapping.
-fn bare(value: &Value) -> String {
+/// Text without quotes, ids without their wrapping, and small numbers as 1e-8.
+pub(super) fn bare(value: &Value) -> String {
     match value {
         Value::String(text) => text.trim_start_matches("popgym-").trim_end_matches("-v0").to_owned(),
+        Value::Float(number) => format!("{number:?}"),
         other => other.to_string(),
     }
 }
 
 /// All values that are no tables, by their dotted keys.
-fn flat(table: &Table) -> BTreeMap<String, &Value> {
+pub(super) fn flat(table: &Table) -> BTreeMap<String, &Value> {
     let mut values = BTreeMap::new();
     for (key, value) in table {
         match value {
@@ -85,6 +87,18 @@ mod tests {
             "env = 'popgym-RepeatFirstEasy-v0'\nseed = 2\n[ppo]\nclip = 0.2\npasses = 4\n[service]\nactors = 2",
         ]);
         assert_eq!(found, ["passes 3, seed 1", "passes 4, seed 2"]);
+    }
+
+    #[test]
+    fn numbers_are_short() {
+        let found = labelled(&["x = 0.00000001", "x = 0.3", "x = 10.0", "x = inf", "x = 3"]);
+        assert_eq!(found, ["x 1e-8", "x 0.3", "x 10.0", "x inf", "x 3"]);
+    }
+
+    #[test]
+    fn threads_count_but_not_how_often_is_saved() {
+        let found = labelled(&["threads = 1\ncheckpoint_epochs = 5", "threads = 2\ncheckpoint_epochs = 6"]);
+        assert_eq!(found, ["threads 1", "threads 2"]);
     }
 
     #[test]

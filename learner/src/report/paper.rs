@@ -16,6 +16,11 @@ pub const ROUNDING: f64 = 0.0005;
 pub const MEMORIES: [&str; 13] =
     ["MLP", "PosMLP", "FWP", "FART", "S4D", "TCN", "Fr.Stack", "LMU", "IndRNN", "Elman", "GRU", "LSTM", "DNC"];
 
+/// The place of `memory` in the paper's tables; memories that are not there come last.
+pub fn place(memory: &str) -> usize {
+    MEMORIES.iter().position(|known| *known == memory).unwrap_or(usize::MAX)
+}
+
 /// MMER of the paper, over [`TRIALS`] trials.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Score {
@@ -75,6 +80,11 @@ pub fn memory_mark(memory: &str) -> Option<&'static str> {
         "IndRNN" => Some("the paper's IndRNN ignored its activation and began with biases in (0, 1)"),
         _ => None,
     }
+}
+
+/// `name`, with an asterisk if there is a mark.
+pub fn marked(name: &str, mark: Option<&str>) -> String {
+    format!("{name}{}", if mark.is_some() { "*" } else { "" })
 }
 
 /// What changed in the rules of `game` after the paper, if anything did.

@@ -10,11 +10,12 @@ use serde::Deserialize;
 use toml::Table;
 
 use super::blocks::mmer_65k;
+use super::changes::{changes, cut_after};
 use crate::config::read_table;
 use crate::observer::{EpochMetrics, MetricsCsv, Summary, SummaryJson, TimingCsv};
 use crate::run_dir::RunDir;
 
-/// What a run was to learn, and with which preset: figures of different presets are never mixed.
+/// What a run was to learn, and with which hyper-parameters: figures of different ones are never mixed.
 #[derive(Clone, Debug)]
 pub struct Task {
     /// Place of the environment among all that are known.
@@ -23,7 +24,7 @@ pub struct Task {
     pub env: String,
     /// Without the difficulty.
     pub game: String,
-    /// As the paper's tables call it, if they do.
+    /// As the paper's tables call it, if they have this task.
     pub paper_game: Option<String>,
     /// What kind of environment it is.
     pub group: String,
@@ -31,8 +32,11 @@ pub struct Task {
     pub difficulty: Option<Difficulty>,
     /// Smallest and largest possible return.
     pub return_range: (f64, f64),
-    /// The runs' preset.
+    /// The runs' preset, and what was changed of it: `quick` or `quick, clip 0.3`.
     pub preset: String,
+    /// The number of steps after which episodes are cut, if that is before their own end: then it is not the benchmark's
+    /// task, and the paper has no figure of it.
+    pub cut_after: Option<i64>,
 }
 
 impl Task {
@@ -47,18 +51,19 @@ impl Task {
         (value - low) / (high - low)
     }
 
-    fn new(order: usize, entry: &Entry, preset: String) -> Self {
+    fn new(order: usize, entry: &Entry, preset: String, cut_after: Option<i64>) -> Self {
         let level = entry.difficulty.map_or_else(String::new, |level| level.to_string());
         let game = |name: &str| name.strip_suffix(&level).unwrap_or(name).to_owned();
         Self {
             order,
             env: entry.name.clone(),
             game: game(&entry.name),
-            paper_game: entry.paper_name.as_deref().map(game),
+            paper_game: entry.paper_name.as_deref().filter(|_| cut_after.is_none()).map(game),
             group: entry.group.clone(),
             difficulty: entry.difficulty,
             return_range: entry.spec.return_range,
             preset,
+            cut_after,
         }
     }
 }
@@ -142,10 +147,17 @@ impl Run {
         let Some(end) = rows.last() else { bail!("no epoch has been completed yet") };
         let mmer = rows.iter().map(|row| row.mean_return).filter(|value| value.is_finite()).reduce(f64::max);
         let summary = summary(dir).filter(|summary| summary.env_steps == end.env_steps);
-        let seconds = || TimingCsv::read(dir).ok()?.last().map(|row| row.wall_seconds);
+        let seconds =
+            || TimingCsv::read(dir).ok()?.last().map(|row| row.wall_seconds).filter(|seconds| seconds.is_finite());
+        // A budget may have been raised after the summary was written.
+        let far_enough =
+            end.env_steps >= keys.steps || keys.stop_at_mmer.zip(mmer).is_some_and(|(target, mmer)| mmer >= target);
+        let reason = summary.as_ref().map(|summary| summary.stopped_by.clone());
+        let preset = std::iter::once(keys.preset).chain(changes(&config, entry, envs, memories));
+        let preset = preset.collect::<Vec<_>>().join(", ");
         Ok(Self {
             dir: dir.to_owned(),
-            task: Task::new(order, entry, keys.preset),
+            task: Task::new(order, entry, preset, cut_after(&config, entry)),
             paper_memory: memories.get(&keys.memory.name).map_or(keys.memory.name.clone(), |m| m.paper_name.to_owned()),
             memory: keys.memory.name,
             seed: keys.seed,
@@ -156,8 +168,8 @@ impl Run {
             mmer: mmer.context("no epoch's mean return in metrics.csv is a finite number")?,
             mmer_65k: mmer_65k(&rows),
             last: end.mean_return,
-            wall_seconds: summary.as_ref().map(|summary| summary.wall_seconds).or_else(seconds),
-            stopped_by: summary.map(|summary| summary.stopped_by).filter(|reason| reason != "interrupt"),
+            wall_seconds: summary.map(|summary| summary.wall_seconds).or_else(seconds),
+            stopped_by: reason.filter(|reason| reason != "interrupt" && far_enough),
             curve: cumulative_maximum(&rows),
             config,
         })
@@ -241,7 +253,7 @@ mod tests {
     #[test]
     fn a_complete_run() {
         let dir = tempfile::tempdir().unwrap();
-        let files = RunFiles { budget: 100_000, ..RunFiles::default() };
+        let files = RunFiles { budget: Some(100_000), ..RunFiles::default() };
         files.write(dir.path(), &[(50_000, 200, 0.25), (50_000, 200, 0.75), (20_000, 200, 0.5)]);
         let run = read(dir.path()).unwrap();
         assert_eq!((run.task.env.as_str(), run.task.game.as_str()), ("RepeatFirstEasy", "RepeatFirst"));
@@ -258,9 +270,10 @@ mod tests {
     fn an_interrupted_run_and_one_that_goes_on() {
         let dir = tempfile::tempdir().unwrap();
         let epochs = [(50_000, 200, 0.25)];
-        RunFiles { stopped_by: "interrupt", ..RunFiles::default() }.write(dir.path(), &epochs);
+        let budget = Some(1_000_000);
+        RunFiles { stopped_by: "interrupt", budget, ..RunFiles::default() }.write(dir.path(), &epochs);
         assert!(!read(dir.path()).unwrap().complete());
-        RunFiles { stopped_by: "mmer", ..RunFiles::default() }.write(dir.path(), &epochs);
+        RunFiles { stopped_by: "mmer", budget, ..RunFiles::default() }.write(dir.path(), &epochs);
         let run = read(dir.path()).unwrap();
         assert!(run.complete() && run.stopped_early() && run.mmer_65k.is_none());
         // Resumed since: the summary is of an earlier end.
@@ -268,6 +281,29 @@ mod tests {
         RunFiles::default().write(dir.path(), &[(50_000, 200, 0.25), (10, 1, 0.5)]);
         fs::write(dir.path().join("summary.json"), summary).unwrap();
         assert!(!read(dir.path()).unwrap().complete());
+    }
+
+    #[test]
+    fn a_raised_budget_reopens_a_run() {
+        let dir = tempfile::tempdir().unwrap();
+        RunFiles::default().write(dir.path(), &[(50_000, 200, 0.25)]);
+        assert!(read(dir.path()).unwrap().complete());
+        // Resumed with more steps, and killed before the next epoch.
+        let path = dir.path().join("config.toml");
+        let config = fs::read_to_string(&path).unwrap();
+        fs::write(&path, config.replace("steps = 50000", "steps = 50001")).unwrap();
+        let run = read(dir.path()).unwrap();
+        assert_eq!((run.complete(), run.stopped_by, run.budget), (false, None, 50_001));
+    }
+
+    #[test]
+    fn another_configuration_is_another_task() {
+        let dir = tempfile::tempdir().unwrap();
+        RunFiles { keys: "ppo.clip = 0.3\nmax_episode_steps = 20\n", ..RunFiles::default() }
+            .write(dir.path(), &[(50_000, 200, 0.25)]);
+        let task = read(dir.path()).unwrap().task;
+        assert_eq!(task.preset, "quick, max_episode_steps 20, clip 0.3");
+        assert_eq!((task.cut_after, task.paper_game), (Some(20), None));
     }
 
     #[test]

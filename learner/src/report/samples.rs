@@ -18,7 +18,10 @@ pub(crate) struct RunFiles<'a> {
     pub(crate) memory: &'a str,
     pub(crate) preset: &'a str,
     pub(crate) seed: u64,
-    pub(crate) budget: u64,
+    /// None: the steps that it did.
+    pub(crate) budget: Option<u64>,
+    /// More lines of the configuration.
+    pub(crate) keys: &'a str,
     /// Empty: the run was killed.
     pub(crate) stopped_by: &'a str,
 }
@@ -31,7 +34,8 @@ impl Default for RunFiles<'_> {
             memory: "gru",
             preset: "quick",
             seed: 0,
-            budget: 1_000_000,
+            budget: None,
+            keys: "",
             stopped_by: "steps",
         }
     }
@@ -42,12 +46,6 @@ impl RunFiles<'_> {
     /// second.
     pub(crate) fn write(&self, dir: &Path, epochs: &[(u64, u64, f64)]) {
         fs::create_dir_all(dir).unwrap();
-        let Self { env, observability, memory, preset, seed, budget, stopped_by } = self;
-        let config = format!(
-            "env = \"{env}\"\nobservability = \"{observability}\"\npreset = \"{preset}\"\nseed = {seed}\n\
-             steps = {budget}\n[memory]\nname = \"{memory}\"\n"
-        );
-        fs::write(dir.join("config.toml"), config).unwrap();
         let (mut metrics, mut timing) = (MetricsCsv::open(dir, 0).unwrap(), TimingCsv::open(dir, 0).unwrap());
         let (mut env_steps, mut episodes, mut mmer) = (0, 0, f64::NEG_INFINITY);
         for (epoch, (more_steps, more_episodes, value)) in epochs.iter().enumerate() {
@@ -63,6 +61,15 @@ impl RunFiles<'_> {
             metrics.epoch(&report).unwrap();
             timing.epoch(&report).unwrap();
         }
+        let Self { env, observability, memory, preset, seed, keys, stopped_by, .. } = self;
+        let budget = self.budget.unwrap_or(env_steps);
+        assert!(*stopped_by != "steps" || env_steps >= budget, "no run ends like that");
+        let target = if *stopped_by == "mmer" { format!("stop_at_mmer = {mmer:?}\n") } else { String::new() };
+        let config = format!(
+            "env = \"{env}\"\nobservability = \"{observability}\"\npreset = \"{preset}\"\nseed = {seed}\n\
+             steps = {budget}\n{target}memory.name = \"{memory}\"\n{keys}"
+        );
+        fs::write(dir.join("config.toml"), config).unwrap();
         let summary = Summary {
             env_steps,
             stopped_by: (*stopped_by).to_owned(),

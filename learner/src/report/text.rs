@@ -9,7 +9,8 @@ pub const NONE: &str = "–";
 /// A count of steps with three digits: 164220 is 164k.
 pub fn steps(count: u64) -> String {
     let (value, unit) = match count {
-        1_000_000.. => (count as f64 / 1e6, "M"),
+        // What rounds to 1000k is 1M.
+        999_500.. => (count as f64 / 1e6, "M"),
         1_000.. => (count as f64 / 1e3, "k"),
         _ => (count as f64, ""),
     };
@@ -49,9 +50,17 @@ pub fn sample(sample: Option<&Sample>) -> String {
     format!("{}{std}", number(Some(*mean)))
 }
 
+/// Mean and standard deviation of the best blocks, and of how many seeds they are if not all have one.
+pub fn best_blocks(cell: &Cell) -> String {
+    let (seeds, all) = (cell.mmer_65k.map_or(0, |sample| sample.n), cell.runs.len());
+    let part = if seeds > 0 && seeds < all { format!(" ({seeds} of {all} seeds)") } else { String::new() };
+    format!("{}{part}", sample(cell.mmer_65k.as_ref()))
+}
+
 /// Whether ours is within two standard errors of the paper's.
 pub fn within(cell: &Cell) -> &'static str {
     match cell.verdict {
+        None if cell.paper.is_some() && cell.lower_bound() => "lower bound: stopped at its target",
         None => NONE,
         Some(verdict) if verdict.within() => "yes",
         Some(verdict) if verdict.difference > 0.0 => "no, higher",
@@ -86,13 +95,15 @@ pub fn aligned(rows: &[Vec<String>]) -> String {
 
 #[cfg(test)]
 mod tests {
-    use super::super::samples::cells_of;
+    use super::super::cell::cells;
+    use super::super::samples::{RunFiles, cells_of, collected};
     use super::*;
 
     #[test]
     fn counts_of_steps() {
-        let found = [0, 999, 1000, 65_536, 164_220, 1_000_000, 1_003_520, 15_000_000].map(steps);
-        assert_eq!(found, ["0", "999", "1k", "65.5k", "164k", "1M", "1M", "15M"]);
+        let found =
+            [0, 999, 1000, 65_536, 164_220, 999_499, 999_500, 999_999, 1_000_000, 1_003_520, 15_000_000].map(steps);
+        assert_eq!(found, ["0", "999", "1k", "65.5k", "164k", "999k", "1M", "1M", "1M", "1M", "15M"]);
         assert_eq!(span((500_000, 1_001_000)), "500k–1M");
         assert_eq!(span((1_000_001, 1_000_900)), "1M");
     }
@@ -115,10 +126,22 @@ mod tests {
     #[test]
     fn a_cell_in_words() {
         let cells = cells_of(&[("CountRecallEasy", "fart", &[1.0])]);
-        assert_eq!(steps_of(&cells[0]), "70k of 1M");
+        assert_eq!((steps_of(&cells[0]), best_blocks(&cells[0])), ("70k".to_owned(), "1.000".to_owned()));
         assert_eq!(within(&cells[0]), "no, higher");
         let notes = notes(&cells[0]);
         assert!(notes.starts_with("the paper's FART") && notes.contains("largest count"), "{notes}");
         assert!(notes.ends_with("; one seed: only the paper's error is known"));
+    }
+
+    #[test]
+    fn a_cell_that_stopped_at_its_target() {
+        let root = tempfile::tempdir().unwrap();
+        RunFiles { stopped_by: "mmer", budget: Some(1_000_000), ..RunFiles::default() }
+            .write(&root.path().join("0"), &[(60_000, 200, 0.98)]);
+        RunFiles { seed: 1, ..RunFiles::default() }.write(&root.path().join("1"), &[(70_000, 200, 0.5)]);
+        let cell = &cells(collected(&[root.path()]).unwrap().runs).unwrap()[0];
+        assert_eq!(within(cell), "lower bound: stopped at its target");
+        assert_eq!(best_blocks(cell), "0.500 (1 of 2 seeds)");
+        assert_eq!(steps_of(cell), "60k–70k of 70k–1M");
     }
 }

@@ -3,7 +3,7 @@
 use plotters::prelude::*;
 use plotters::style::text_anchor::{HPos, Pos, VPos};
 
-use super::{Figure, Section, WIDTH, behind};
+use super::{Figure, Section, WIDTH, behind, captioned, heading};
 use crate::chart::{FINE, GRID, SvgArea, TEXT, short, svg};
 use crate::report::cell::Cell;
 use crate::report::compared::{Compared, Scores};
@@ -87,7 +87,7 @@ impl Bars {
     fn draw(&self, area: &SvgArea<'_>) -> anyhow::Result<()> {
         let pen = FINE;
         let anchored = |size, h| pen.text(size).pos(Pos::new(h, VPos::Center));
-        area.draw_text(&self.title, &pen.text(13), pen.at(8.0, 8.0))?;
+        area.draw_text(&heading(&self.title), &pen.text(13), pen.at(8.0, 8.0))?;
         for (i, name) in self.legend.iter().enumerate() {
             let (x, y) = (8.0 + 108.0 * i as f64, HEAD + 6.0);
             area.draw(&Rectangle::new([pen.at(x, y - 4.0), pen.at(x + 12.0, y + 4.0)], SHADES[i % 3].filled()))?;
@@ -175,7 +175,7 @@ fn game_figure(cells: &[&Cell]) -> anyhow::Result<Figure> {
     Ok(Figure {
         name: format!("bars-{}-{}", task.game, task.preset),
         title: format!("MMER of {} by memory and difficulty", task.game),
-        caption: format!("{}.", behind(cells, true)),
+        caption: captioned(&bars.title, &format!("{}.", behind(cells, true))),
         svg: bars.svg()?,
     })
 }
@@ -184,7 +184,7 @@ fn game_figure(cells: &[&Cell]) -> anyhow::Result<Figure> {
 pub(super) fn scores(name: &str, compared: &Compared<'_>) -> anyhow::Result<Figure> {
     let bar = |value: Option<f64>| value.map(|value| Bar { value, interval: None, text: String::new() });
     let scores = compared.scores();
-    let row = |score: &Scores| (score.memory.clone(), vec![bar(score.mmer), bar(score.mmer_65k), bar(score.paper)]);
+    let row = |score: &Scores| (score.marked_memory(), vec![bar(score.mmer), bar(score.mmer_65k), bar(score.paper)]);
     let beside = compared.beside_paper();
     let bars = Bars {
         title: format!("Mean return, {}", compared.title()),
@@ -193,15 +193,18 @@ pub(super) fn scores(name: &str, compared: &Compared<'_>) -> anyhow::Result<Figu
         ticks: vec![-1.0, -0.5, 0.0, 0.5, 1.0],
         logarithmic: false,
     };
-    let cells: Vec<&Cell> = compared.tasks.iter().flatten().copied().collect();
+    let cells: Vec<&Cell> = compared.cells().collect();
     Ok(Figure {
         name: name.to_owned(),
         title: bars.title.clone(),
-        caption: format!(
-            "MMER: mean over {}. MMER-65k and the paper (15M steps, DNC 10M): mean over the {beside} of these in which every \
-             memory has both. {}.",
-            text::plural(compared.tasks.len(), "environment"),
-            behind(&cells, false)
+        caption: captioned(
+            &bars.title,
+            &format!(
+                "MMER: mean over {}. MMER-65k and the paper (15M steps, DNC 10M): mean over the {beside} of these in which \
+                 every memory can be set beside the paper. *: the paper's figures are of another model. {}.",
+                text::plural(compared.tasks.len(), "environment"),
+                behind(&cells, false)
+            ),
         ),
         svg: bars.svg()?,
     })
@@ -223,7 +226,7 @@ mod tests {
         let section = section(&cells).unwrap();
         let names: Vec<_> = section.figures.iter().map(|figure| figure.name.as_str()).collect();
         assert_eq!(names, ["bars-RepeatFirst-quick", "bars-Battleship-quick"]);
-        assert_eq!(section.figures[0].caption, "1 to 2 seeds, intervals from 2; 70k steps, budget 1M.");
+        assert_eq!(section.figures[0].caption, "1 to 2 seeds, intervals from 2; 70k steps, budget 70k.");
         for expected in ["Easy", "Hard", "GRU", "MLP", "0.25"] {
             assert!(section.figures[0].svg.contains(expected), "no `{expected}`");
         }

@@ -3,7 +3,7 @@
 use plotters::prelude::*;
 use plotters::style::text_anchor::{HPos, Pos, VPos};
 
-use super::{Figure, Section, WIDTH, behind};
+use super::{Figure, Section, WIDTH, behind, captioned, heading};
 use crate::chart::{FINE, GRID, SvgArea, TEXT, short, svg};
 use crate::report::cell::Cell;
 use crate::report::compared::Compared;
@@ -22,11 +22,11 @@ pub(super) fn section(compared: &[Compared<'_>]) -> anyhow::Result<Section> {
     let figure = |(i, compared): (usize, &Compared<'_>)| {
         let rows = compared.standardised();
         let height = HEAD + ROW * rows.len() as f64 + AXIS;
-        let cells: Vec<&Cell> = compared.tasks.iter().flatten().copied().collect();
+        let cells: Vec<&Cell> = compared.cells().collect();
         Ok(Figure {
             name: format!("summary-{}", i + 1),
             title: format!("Standardised MMER, {}", compared.title()),
-            caption: format!("{}.", behind(&cells, false)),
+            caption: captioned(&compared.title(), &format!("{}.", behind(&cells, false))),
             svg: svg((WIDTH, height as u32), FINE, |area| draw(area, &compared.title(), &rows))?,
         })
     };
@@ -47,7 +47,7 @@ fn draw(area: &SvgArea<'_>, title: &str, rows: &[(String, Vec<f64>)]) -> anyhow:
     let anchored = |h| pen.text(11).pos(Pos::new(h, VPos::Center));
     let x = |value: f64| NAMES + value.clamp(0.0, 1.0) * (f64::from(WIDTH) - NAMES - RIGHT);
     let bottom = HEAD + ROW * rows.len() as f64;
-    area.draw_text(title, &pen.text(13), pen.at(8.0, 8.0))?;
+    area.draw_text(&heading(title), &pen.text(13), pen.at(8.0, 8.0))?;
     for tick in super::bars::unit_ticks() {
         let line = vec![pen.at(x(tick), HEAD), pen.at(x(tick), bottom)];
         area.draw(&PathElement::new(line, GRID.stroke_width(pen.px(1))))?;
@@ -79,6 +79,26 @@ mod tests {
     use super::*;
 
     #[test]
+    fn a_box_is_where_its_numbers_are() {
+        let envs = ["RepeatFirstEasy", "RepeatPreviousEasy", "AutoencodeEasy"];
+        let scores: [&[f64]; 3] = [&[-0.5], &[0.0], &[0.5]];
+        let runs: Vec<(&str, &str, &[f64])> =
+            envs.iter().zip(scores).flat_map(|(env, score)| [(*env, "gru", score), (*env, "mlp", score)]).collect();
+        let cells = cells_of(&runs);
+        let svg = &section(&Compared::all(&cells)).unwrap().figures[0].svg;
+        // Of the return range -1 to 1 these are 0.25, 0.5 and 0.75, quartiles 0.375 and 0.625. 0 is at 78, 1 at 328, and all
+        // is four times as large. Rows are 24 high and begin at 30.
+        for expected in [
+            "<rect x=\"687\" y=\"140\" width=\"250\" height=\"56\"",
+            "points=\"562,168 1062,168 \"",
+            "points=\"812,140 812,196 \"",
+            "<circle cx=\"812\" cy=\"168\"",
+        ] {
+            assert!(svg.contains(expected), "no `{expected}` in {svg}");
+        }
+    }
+
+    #[test]
     fn boxes_where_there_are_enough_environments() {
         let envs = ["RepeatFirstEasy", "RepeatPreviousEasy", "AutoencodeEasy"];
         let runs: Vec<(&str, &str, &[f64])> =
@@ -86,7 +106,7 @@ mod tests {
         let cells = cells_of(&runs);
         let found = section(&Compared::all(&cells)).unwrap().figures;
         assert_eq!(found.len(), 1);
-        assert!(found[0].svg.contains("2 memories over 3 environments"));
+        assert!(found[0].svg.contains("2 memories over 3 environments, quick"));
         let few = cells_of(&runs[..4]);
         assert!(section(&Compared::all(&few)).unwrap().figures.is_empty());
     }

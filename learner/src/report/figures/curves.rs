@@ -1,6 +1,6 @@
 //! The largest mean return so far, over environment steps.
 
-use super::{Figure, Section, WIDTH, behind, colour};
+use super::{Figure, Section, WIDTH, behind, captioned, colour, heading};
 use crate::chart::{FINE, Lines, Series, svg};
 use crate::report::cell::Cell;
 use crate::report::run::Run;
@@ -15,7 +15,8 @@ pub(super) fn section(cells: &[Cell]) -> anyhow::Result<Section> {
     Ok(Section {
         title: "Learning curves".into(),
         text: "The largest mean return of an epoch so far, over environment steps: the mean over seeds, with its 95% \
-               bootstrap interval where there are two seeds or more. A run that has ended keeps its last value."
+               bootstrap interval where there are two seeds or more. A run that has come to its end keeps its last value; one that \
+               was not finished counts as far as it went."
             .into(),
         figures: tasks.map(figure).collect::<anyhow::Result<_>>()?,
     })
@@ -23,8 +24,9 @@ pub(super) fn section(cells: &[Cell]) -> anyhow::Result<Section> {
 
 fn figure(cells: &[Cell]) -> anyhow::Result<Figure> {
     let task = &cells[0].task;
+    let title = format!("{}, {}", task.env, task.preset);
     let lines = Lines {
-        title: format!("{}, {}", task.env, task.preset),
+        title: heading(&title),
         x_desc: "environment steps".into(),
         y_desc: "return per episode".into(),
         series: cells.iter().map(series).collect(),
@@ -33,7 +35,7 @@ fn figure(cells: &[Cell]) -> anyhow::Result<Figure> {
     Ok(Figure {
         name: format!("curve-{}-{}", task.env, task.preset),
         title: format!("Largest mean return so far in {} by memory", task.env),
-        caption: format!("{}.", behind(&cells.iter().collect::<Vec<_>>(), true)),
+        caption: captioned(&title, &format!("{}.", behind(&cells.iter().collect::<Vec<_>>(), true))),
         svg: svg((WIDTH, lines.height()), FINE, |area| lines.draw(area, FINE))?,
     })
 }
@@ -41,7 +43,7 @@ fn figure(cells: &[Cell]) -> anyhow::Result<Figure> {
 fn series(cell: &Cell) -> Series {
     let at: Vec<(f64, Vec<f64>)> = grid(&cell.runs)
         .into_iter()
-        .map(|steps| (steps as f64, cell.runs.iter().filter_map(|run| value_at(&run.curve, steps)).collect()))
+        .map(|steps| (steps as f64, cell.runs.iter().filter_map(|run| value_at(run, steps)).collect()))
         .collect();
     let points = at.iter().filter_map(|(x, values)| Some((*x, mean(values)?))).collect();
     let band = at.iter().filter_map(|(x, values)| bootstrap_interval(values).map(|(low, high)| (*x, low, high)));
@@ -58,10 +60,12 @@ fn grid(runs: &[Run]) -> Vec<u64> {
     grid
 }
 
-/// The value of a curve after `steps` steps; none before its first epoch.
-fn value_at(curve: &[(u64, f64)], steps: u64) -> Option<f64> {
-    let after = curve.partition_point(|point| point.0 <= steps);
-    Some(curve.get(after.checked_sub(1)?)?.1)
+/// The value of a run's curve after `steps` steps; none before its first epoch, nor after the last of a run that was not
+/// finished.
+fn value_at(run: &Run, steps: u64) -> Option<f64> {
+    let after = run.curve.partition_point(|point| point.0 <= steps);
+    let known = run.complete() || steps <= run.steps;
+    Some(run.curve.get(after.checked_sub(1)?)?.1).filter(|_| known)
 }
 
 #[cfg(test)]
@@ -72,11 +76,14 @@ mod tests {
 
     #[test]
     fn curves_are_steps_that_stay() {
-        let curve = [(10, 0.1), (20, 0.2)];
-        assert_eq!(
-            [9, 10, 19, 20, 99].map(|x| value_at(&curve, x)),
-            [None, Some(0.1), Some(0.1), Some(0.2), Some(0.2)]
-        );
+        let root = tempfile::tempdir().unwrap();
+        RunFiles::default().write(root.path(), &[(10, 10, 0.1), (10, 10, 0.2)]);
+        let mut run = collected(&[root.path()]).unwrap().runs.remove(0);
+        let at = |run: &Run| [9, 10, 19, 20, 99].map(|steps| value_at(run, steps));
+        assert_eq!(at(&run), [None, Some(0.1), Some(0.1), Some(0.2), Some(0.2)]);
+        // Killed: nobody knows how it would have gone on.
+        run.stopped_by = None;
+        assert_eq!(at(&run), [None, Some(0.1), Some(0.1), Some(0.2), None]);
     }
 
     #[test]

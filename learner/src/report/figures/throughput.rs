@@ -58,12 +58,8 @@ impl Throughput {
         let text = std::fs::read_to_string(path).with_context(|| format!("cannot read {}", path.display()))?;
         let wrong = || format!("{} is not what `cargo bench -p popgym-models -- --json FILE` writes", path.display());
         let found: Self = serde_json::from_str(&text).with_context(wrong)?;
-        let seconds = found.memories.iter().flat_map(|memory| {
-            let training = memory.training.iter().map(|training| &training.seconds);
-            training.chain(memory.steps.iter().map(|step| &step.seconds))
-        });
-        for Seconds { mean, half_width } in seconds {
-            anyhow::ensure!(*mean > 0.0 && *half_width >= 0.0, "{}: a time of {mean} ± {half_width} s", path.display());
+        for memory in &found.memories {
+            memory.check().with_context(|| format!("{}, {}", path.display(), memory.paper_name))?;
         }
         Ok(found)
     }
@@ -72,6 +68,36 @@ impl Throughput {
     fn place(&self) -> String {
         let processor = self.processor.as_deref().unwrap_or("an unnamed processor");
         format!("device {}, {} threads of {processor}", self.device, self.threads)
+    }
+}
+
+impl Memory {
+    /// Checks every number.
+    fn check(&self) -> anyhow::Result<()> {
+        for Training { shape, seconds } in &self.training {
+            check_count("training.shape.sequences", shape.sequences)?;
+            check_count("training.shape.steps", shape.steps)?;
+            seconds.check("training.seconds")?;
+        }
+        for Step { rows, seconds } in &self.steps {
+            check_count("steps.rows", *rows)?;
+            seconds.check("steps.seconds")?;
+        }
+        Ok(())
+    }
+}
+
+fn check_count(key: &str, value: i64) -> anyhow::Result<()> {
+    anyhow::ensure!((1..=1 << 30).contains(&value), "{key} is {value}, allowed is 1 to {}", 1 << 30);
+    Ok(())
+}
+
+impl Seconds {
+    fn check(&self, key: &str) -> anyhow::Result<()> {
+        let Self { mean, half_width } = *self;
+        anyhow::ensure!((1e-9..=1e9).contains(&mean), "{key}.mean is {mean}, allowed is 1e-9 to 1e9 s");
+        anyhow::ensure!((0.0..=1e9).contains(&half_width), "{key}.half_width is {half_width}, allowed is 0 to 1e9 s");
+        Ok(())
     }
 }
 
@@ -168,6 +194,27 @@ mod tests {
         let section = throughput(&found).unwrap();
         let names: Vec<_> = section.figures.iter().map(|figure| figure.name.as_str()).collect();
         assert_eq!(names, ["throughput-training-8x1000", "throughput-step-16"]);
+    }
+
+    #[test]
+    fn impossible_numbers_are_named() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("x.json");
+        let refused = |text: &str| {
+            std::fs::write(&path, text).unwrap();
+            let error = format!("{:#}", Throughput::read(&path).unwrap_err());
+            error.strip_prefix(&format!("{}, GRU: ", path.display())).unwrap().to_owned()
+        };
+        let allowed = "allowed is 1 to 1073741824";
+        assert_eq!(refused(&JSON.replace("\"rows\": 16", "\"rows\": 0")), format!("steps.rows is 0, {allowed}"));
+        let many = refused(&JSON.replace("1000}", "1073741825}"));
+        assert_eq!(many, format!("training.shape.steps is 1073741825, {allowed}"));
+        let none = refused(&JSON.replace("\"sequences\": 8", "\"sequences\": -8"));
+        assert_eq!(none, format!("training.shape.sequences is -8, {allowed}"));
+        let short = refused(&JSON.replace("\"mean\": 0.5", "\"mean\": 1e-300"));
+        assert!(short.starts_with("training.seconds.mean is 0.000"), "{short}");
+        std::fs::write(&path, JSON).unwrap();
+        assert!(Throughput::read(&path).is_ok());
     }
 
     #[test]
