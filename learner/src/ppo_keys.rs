@@ -66,8 +66,6 @@ ppo_keys! {
     kl_coef: f64 = 0.2, |_: &Quick| 0.0;
     /// KL that the coefficient is adapted to, nats a step
     kl_target: f64 = 0.01, |_: &Quick| 0.01;
-    /// No further minibatch in an epoch after one whose KL, nats a step, is above it (inf: never)
-    kl_stop: f64 = f64::INFINITY, |_: &Quick| f64::INFINITY;
     /// Adam's learning rate
     learning_rate: f64 = 5e-5, |_: &Quick| 7e-4;
     /// constant, or linear: falling to 0 at the run's last step
@@ -157,7 +155,6 @@ impl Ppo {
         not_negative("entropy_coef", self.entropy_coef)?;
         not_negative("kl_coef", self.kl_coef)?;
         positive("kl_target", self.kl_target)?;
-        check("kl_stop", self.kl_stop, self.kl_stop > 0.0, "more than 0")?;
         positive("learning_rate", self.learning_rate)?;
         for (key, beta) in [("adam_beta1", self.adam_beta1), ("adam_beta2", self.adam_beta2)] {
             check(key, beta, (0.0..1.0).contains(&beta), "0 up to, but not, 1")?;

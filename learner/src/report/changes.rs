@@ -11,7 +11,7 @@ use crate::config::Config;
 const DECISIVE: [&str; 5] = ["ppo.", "policy.", "memory.", "lag", "max_episode_steps"];
 
 /// The decisive keys of `config` that differ from its preset's own values for this environment, with their values, such as
-/// `clip 0.3`. Empty where the preset is not known here: then nothing can be said.
+/// `clip 0.4`. Empty where the preset is not known here: then nothing can be said.
 pub fn changes(config: &Table, entry: &Entry, envs: &Registry, memories: &memory::Registry) -> Vec<String> {
     let text = |key: &str| config.get(key).and_then(Value::as_str).unwrap_or_default();
     let Some(own) = own(&entry.spec.id, text("preset"), memory_name(config), envs, memories) else {
@@ -69,13 +69,13 @@ mod tests {
 
     #[test]
     fn only_what_results_depend_on() {
-        // The preset's own: clip 0.2, passes 3, hidden_size 256, lag 0; RepeatFirstEasy has 52 steps.
+        // The preset's own: clip 0.3, passes 3, hidden_size 256, lag 0; RepeatFirstEasy has 52 steps.
         let plain = "preset = 'quick'\nseed = 7\nsteps = 5\nthreads = 3\nmax_episode_steps = 900\nservice.actors = 9\n\
-                     stop_at_mmer = 0.5\ncheckpoint_epochs = 2\nppo.clip = 0.2\nmemory.name = 'gru'\n";
+                     stop_at_mmer = 0.5\ncheckpoint_epochs = 2\nppo.clip = 0.3\nmemory.name = 'gru'\n";
         assert_eq!(found(plain), [""; 0]);
-        let other = "preset = 'quick'\nlag = 1\nmax_episode_steps = 20\nppo.clip = 0.3\nppo.passes = 3\n\
+        let other = "preset = 'quick'\nlag = 1\nmax_episode_steps = 20\nppo.clip = 0.4\nppo.passes = 3\n\
                      memory.name = 'gru'\nmemory.hidden_size = 128\n";
-        assert_eq!(found(other), ["lag 1", "max_episode_steps 20", "hidden_size 128", "clip 0.3"]);
+        assert_eq!(found(other), ["lag 1", "max_episode_steps 20", "hidden_size 128", "clip 0.4"]);
         let paper = "preset = 'paper'\nppo.clip = 0.3\nmemory.name = 'gru'\n";
         assert_eq!(found(paper), [""; 0]);
     }

@@ -218,7 +218,7 @@ mod tests {
     fn variants_of_a_preset_are_different_things() {
         let root = tempfile::tempdir().unwrap();
         // The first is the preset as it is.
-        let variants: Vec<String> = (20..34).map(|i| format!("ppo.clip = 0.{i}\n")).collect();
+        let variants: Vec<String> = (30..44).map(|i| format!("ppo.clip = 0.{i}\n")).collect();
         for (i, keys) in variants.iter().enumerate() {
             RunFiles { keys, ..RunFiles::default() }.write(&root.path().join(i.to_string()), &[(70_000, 200, 0.5)]);
         }
@@ -226,7 +226,7 @@ mod tests {
         assert_eq!((found.runs.len(), found.notes.len()), (14, 0));
         let cells = super::super::cell::cells(found.runs).unwrap();
         assert_eq!(cells.len(), 14);
-        assert_eq!((cells[0].task.preset.as_str(), cells[3].task.preset.as_str()), ("quick", "quick, clip 0.23"));
+        assert_eq!((cells[0].task.preset.as_str(), cells[3].task.preset.as_str()), ("quick", "quick, clip 0.33"));
     }
 
     #[test]

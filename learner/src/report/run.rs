@@ -32,7 +32,7 @@ pub struct Task {
     pub difficulty: Option<Difficulty>,
     /// Smallest and largest possible return.
     pub return_range: (f64, f64),
-    /// The runs' preset, and what was changed of it: `quick` or `quick, clip 0.3`.
+    /// The runs' preset, and what was changed of it: `quick` or `quick, clip 0.4`.
     pub preset: String,
     /// The number of steps after which episodes are cut, if that is before their own end: then it is not the benchmark's
     /// task, and the paper has no figure of it.
@@ -299,10 +299,10 @@ mod tests {
     #[test]
     fn another_configuration_is_another_task() {
         let dir = tempfile::tempdir().unwrap();
-        RunFiles { keys: "ppo.clip = 0.3\nmax_episode_steps = 20\n", ..RunFiles::default() }
+        RunFiles { keys: "ppo.clip = 0.4\nmax_episode_steps = 20\n", ..RunFiles::default() }
             .write(dir.path(), &[(50_000, 200, 0.25)]);
         let task = read(dir.path()).unwrap().task;
-        assert_eq!(task.preset, "quick, max_episode_steps 20, clip 0.3");
+        assert_eq!(task.preset, "quick, max_episode_steps 20, clip 0.4");
         assert_eq!((task.cut_after, task.paper_game), (Some(20), None));
     }
 
