@@ -61,7 +61,7 @@ ppo_keys! {
     /// Weight of the critic's loss
     value_coef: f64 = 1.0, |_: &Quick| 0.5;
     /// Weight of the entropy bonus
-    entropy_coef: f64 = 0.0, |_: &Quick| 0.0;
+    entropy_coef: f64 = 0.0, |_: &Quick| 0.03;
     /// First coefficient of the KL term
     kl_coef: f64 = 0.2, |_: &Quick| 0.0;
     /// KL that the coefficient is adapted to, nats a step
