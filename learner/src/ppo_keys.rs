@@ -31,7 +31,8 @@ macro_rules! ppo_keys {
                 Self { $( $name: $paper, )+ }
             }
 
-            /// Tuned for wall-clock time on two cores. What must differ by environment follows from its specification.
+            /// Tuned for wall-clock time on two cores. What must differ by environment follows from its specification; what each
+            /// departure from the paper buys was measured, see `learner/studies/ablation.md`.
             pub fn quick(env: &EnvSpec) -> Self {
                 let quick = Quick::new(env);
                 Self { $( $name: ($quick)(&quick), )+ }
