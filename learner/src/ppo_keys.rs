@@ -62,7 +62,7 @@ ppo_keys! {
     /// Weight of the critic's loss
     value_coef: f64 = 1.0, |_: &Quick| 0.5;
     /// Weight of the entropy bonus
-    entropy_coef: f64 = 0.0, |_: &Quick| 0.03;
+    entropy_coef: f64 = 0.0, |_: &Quick| 0.01;
     /// First coefficient of the KL term
     kl_coef: f64 = 0.2, |_: &Quick| 0.0;
     /// KL that the coefficient is adapted to, nats a step
@@ -76,7 +76,7 @@ ppo_keys! {
     /// Adam's decay of the second moment
     adam_beta2: f64 = 0.999, |_: &Quick| 0.999;
     /// Adam's epsilon
-    adam_epsilon: f64 = 1e-8, |_: &Quick| 1e-5;
+    adam_epsilon: f64 = 1e-8, |_: &Quick| 1e-8;
     /// The gradient is scaled down to this norm (0: never)
     max_grad_norm: f64 = 0.0, |_: &Quick| 0.5;
     /// Rewards are multiplied by this before returns and values are computed
