@@ -76,6 +76,22 @@ fn steps(memory: &dyn Memory, sequence: &Tensor) -> (Tensor, State) {
     by_steps(sequence, memory.initial_state(1, Device::Cpu), |x, state| memory.step(x, state))
 }
 
+/// What they remember is a sum over the past: it does not hold in which order things came, which only the positional encoding in
+/// the inputs can tell.
+#[test]
+fn sums_do_not_know_the_order() {
+    for (name, knows_order) in [("fart", false), ("fwp", false), ("gru", true)] {
+        let built = memory(name, 12, "");
+        let sequence = random(60, 12);
+        let last = |sequence: &Tensor| tch::no_grad(|| steps(&*built.0, sequence).1);
+        let (forwards, backwards) = (last(&sequence), last(&sequence.flip([0])));
+        for (a, b) in forwards.0.iter().zip(&backwards.0) {
+            let difference = largest(&(a - b)) / largest(a);
+            assert_eq!(difference > 1e-5, knows_order, "{name}: {difference:e}");
+        }
+    }
+}
+
 #[test]
 fn scans_are_the_steps_done_in_f64() {
     for name in NAMES {
