@@ -31,14 +31,15 @@ use crate::screen::terminal::Terminal;
 /// # Errors
 /// A directory without a run or without a checkpoint; no terminal; a file that cannot be written.
 pub fn watch(args: &WatchArgs, extensions: &Extensions) -> Outcome {
+    // Before the first file is touched: an interrupt leaves none behind.
+    let interrupt = args.gif.is_some().then(Interrupt::listen).transpose()?;
     check(args).map_err(Failure::Usage)?;
     let mut spectator = prepare(args, extensions)?;
-    let Some(path) = &args.gif else {
+    let Some((path, interrupt)) = args.gif.as_ref().zip(interrupt) else {
         let ending = app::run(&mut spectator)?;
         say(&spectator.summary())?;
         return Ok(if ending == Ending::Interrupted { EXIT_INTERRUPTED } else { 0 });
     };
-    let interrupt = Interrupt::listen()?;
     match files::replace(path, |partial| film(&mut spectator, args.speed, &interrupt, partial)) {
         Err(_) if interrupt.requested() => return Ok(EXIT_INTERRUPTED),
         result => result?,
