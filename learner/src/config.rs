@@ -158,7 +158,7 @@ impl Config {
         difference(&tables[0], &tables[1], "")
     }
 
-    /// Why a run that stands at `progress` is complete, if it is.
+    /// Why a run with so many steps and such an MMER is complete, if it is.
     pub fn reached(&self, env_steps: u64, mmer: Option<f64>) -> Option<&'static str> {
         let target = self.stop_at_mmer.unwrap_or(f64::INFINITY);
         if mmer.is_some_and(|mmer| mmer >= target) {

@@ -33,10 +33,6 @@ const ROUNDING: f64 = 1e-5;
 /// random weights about 1 sequence in 150 has a difference above 1e-5, all below 3e-4 ([`popgym_models::memory::Dnc`]).
 const JUMP: f64 = 1e-3;
 
-fn tolerance(name: &str) -> f64 {
-    if name == "dnc" { JUMP } else { ROUNDING }
-}
-
 /// The largest difference, of the largest |b| or of 1.
 fn difference(a: &Tensor, b: &Tensor) -> f64 {
     assert_eq!(a.size(), b.size());
@@ -54,9 +50,9 @@ fn states_difference(memory: &dyn Memory, a: &State, b: &State) -> f64 {
     difference(&follow(a), &follow(b))
 }
 
-fn assert_states_equal(memory: &dyn Memory, a: &State, b: &State, tolerance: f64, what: &str) {
+fn assert_states_equal(memory: &dyn Memory, a: &State, b: &State, what: &str) {
     let difference = states_difference(memory, a, b);
-    assert!(difference <= tolerance, "{what}: what follows differs by {difference:e}");
+    assert!(difference <= ROUNDING, "{what}: what follows differs by {difference:e}");
 }
 
 /// Where a memory may jump, at most one of the sequences does.
@@ -64,7 +60,7 @@ fn assert_forms_agree(name: &str, memory: &dyn Memory, lengths: &[i64]) {
     let sequences = sequences(lengths, WIDTH);
     let (outputs, states) = scan_all(memory, &sequences);
     let initial = || memory.initial_state(1, Device::Cpu);
-    let mut tolerance = tolerance(name);
+    let mut tolerance = if name == "dnc" { JUMP } else { ROUNDING };
     for ((sequence, output), state) in sequences.iter().zip(&outputs).zip(&states) {
         let (stepped, last) = by_steps(sequence, initial(), |x, state| memory.step(x, state));
         assert_eq!(output.size(), [sequence.size()[0], memory.output_width()], "{name}");
@@ -135,9 +131,9 @@ proptest! {
                 outputs.push(scan.output);
                 state = scan.state;
             }
-            let (what, tolerance) = (format!("{name}, cut at {cuts:?}"), tolerance(name));
-            assert_close(&Tensor::cat(&outputs, 0), &whole[0], tolerance, &what);
-            assert_states_equal(&*memory, &state, &last[0], tolerance, &what);
+            let what = format!("{name}, cut at {cuts:?}");
+            assert_close(&Tensor::cat(&outputs, 0), &whole[0], ROUNDING, &what);
+            assert_states_equal(&*memory, &state, &last[0], &what);
         }
     }
 
@@ -161,12 +157,12 @@ proptest! {
             let weights: Vec<Tensor> = batch.iter().enumerate().map(|(i, x)| {
                 if i == place { weight.shallow_clone() } else { Tensor::zeros([x.size()[0], memory.output_width()], FLOAT) }
             }).collect();
-            let (what, tolerance) = (format!("{name}, {length} at {place} among {others:?}"), tolerance(name));
+            let what = format!("{name}, {length} at {place} among {others:?}");
 
             let alone = scan_all(&*memory, &[episode.shallow_clone()]);
             let (outputs, states) = scan_all(&*memory, &batch);
-            assert_close(&outputs[place], &alone.0[0], tolerance, &what);
-            assert_states_equal(&*memory, &states[place], &alone.1[0], tolerance, &what);
+            assert_close(&outputs[place], &alone.0[0], ROUNDING, &what);
+            assert_states_equal(&*memory, &states[place], &alone.1[0], &what);
 
             let gradient = |batch: &[Tensor], weights: &[Tensor], place: usize| {
                 let (packing, x) = pack(batch);
@@ -175,11 +171,11 @@ proptest! {
             };
             let (grad_alone, gradients_alone) = gradient(&[episode], &[weight], 0);
             let (grad, gradients) = gradient(&batch, &weights, place);
-            assert_gradient_close(&grad, &grad_alone, 2.0 * tolerance, &what);
+            assert_gradient_close(&grad, &grad_alone, 2.0 * ROUNDING, &what);
             for (key, gradient) in &gradients {
                 let what = format!("{what}: {key}");
                 if largest(&gradients_alone[key]) > 0.0 {
-                    assert_gradient_close(gradient, &gradients_alone[key], 2.0 * tolerance, &what);
+                    assert_gradient_close(gradient, &gradients_alone[key], 2.0 * ROUNDING, &what);
                 } else {
                     // What only acts on a state has no part in a single step.
                     assert!(length <= 2 && largest(gradient) <= 0.0, "{what}: no gradient");
