@@ -29,10 +29,6 @@ fn scan_all(memory: &dyn Memory, sequences: &[Tensor]) -> (Vec<Tensor>, Vec<Stat
 /// Of the largest output, or of 1 if that is more.
 const ROUNDING: f64 = 1e-5;
 
-/// The DNC's output jumps where two usages cross, and of cells as good as equally used rounding decides which is written. With
-/// random weights about 1 sequence in 150 has a difference above 1e-5, all below 3e-4 ([`popgym_models::memory::Dnc`]).
-const JUMP: f64 = 1e-3;
-
 /// The largest difference, of the largest |b| or of 1.
 fn difference(a: &Tensor, b: &Tensor) -> f64 {
     assert_eq!(a.size(), b.size());
@@ -41,41 +37,56 @@ fn difference(a: &Tensor, b: &Tensor) -> f64 {
 
 /// States are equal if what follows from them is. (Rounding may decide which of a DNC's unused cells is written; it makes no
 /// difference to anything read later.)
-fn states_difference(memory: &dyn Memory, a: &State, b: &State) -> f64 {
+fn assert_states_equal(memory: &dyn Memory, a: &State, b: &State, what: &str) {
     let x = random(6, WIDTH);
     let follow = |state: &State| {
         let state = State(state.0.iter().map(Tensor::copy).collect());
         by_steps(&x, state, |x, state| memory.step(x, state)).0
     };
-    difference(&follow(a), &follow(b))
+    assert_close(&follow(a), &follow(b), ROUNDING, &format!("{what}: what follows"));
 }
 
-fn assert_states_equal(memory: &dyn Memory, a: &State, b: &State, what: &str) {
-    let difference = states_difference(memory, a, b);
-    assert!(difference <= ROUNDING, "{what}: what follows differs by {difference:e}");
+/// The DNC's output jumps where two usages cross ([`popgym_models::memory::Dnc`]): rounding decides which of the cells is
+/// written. Only from such a step on may its outputs differ. (Unused cells are interchangeable and do not count.)
+fn begins_at_a_crossing(memory: &dyn Memory, inputs: &Tensor, output: &Tensor, stepped: &Tensor) -> bool {
+    /// A few times f32's rounding of a usage.
+    const CLOSE: f64 = 5e-7;
+    const USED: f64 = 1e-3;
+    let differs = (output - stepped).abs().amax(&[1][..], false).gt(ROUNDING * largest(stepped).max(1.0));
+    let first = differs.to_kind(Kind::Float).argmax(0, false).int64_value(&[]);
+    let usages = |x: &Tensor, state: &State| {
+        let (_, state) = memory.step(x, state);
+        (state.0[7].copy(), state)
+    };
+    let initial = memory.initial_state(1, Device::Cpu);
+    let usages = by_steps(&inputs.narrow(0, 0, first + 1), initial, usages).0.sort(1, false).0;
+    let pairs = usages.size()[1] - 1;
+    let (lower, gaps) = (usages.narrow(1, 0, pairs), usages.diff(1, 1, None::<Tensor>, None::<Tensor>));
+    lower.gt(USED).logical_and(&gaps.lt(CLOSE)).any().int64_value(&[]) == 1
 }
 
-/// Where a memory may jump, at most one of the sequences does.
+/// Outputs, and what follows from the states, are those of the steps.
 fn assert_forms_agree(name: &str, memory: &dyn Memory, lengths: &[i64]) {
     let sequences = sequences(lengths, WIDTH);
     let (outputs, states) = scan_all(memory, &sequences);
     let initial = || memory.initial_state(1, Device::Cpu);
-    let mut tolerance = if name == "dnc" { JUMP } else { ROUNDING };
-    for ((sequence, output), state) in sequences.iter().zip(&outputs).zip(&states) {
-        let (stepped, last) = by_steps(sequence, initial(), |x, state| memory.step(x, state));
+    let step = |x: &Tensor, state: &State| memory.step(x, state);
+    for ((sequence, output), state) in sequences.iter().zip(outputs).zip(states) {
         assert_eq!(output.size(), [sequence.size()[0], memory.output_width()], "{name}");
-        let (acted, last_acted) = by_steps(sequence, initial(), |x, state| memory.act(x, state));
-        let differences = [
-            ("scan", difference(output, &stepped)),
-            ("act", difference(&acted, &stepped)),
-            ("what follows a scan", states_difference(memory, state, &last)),
-            ("what follows act", states_difference(memory, &last_acted, &last)),
-        ];
-        let steps = sequence.size()[0];
-        let worst = differences.iter().max_by(|a, b| a.1.total_cmp(&b.1)).unwrap().1;
-        assert!(worst <= tolerance, "{name}, {steps} of {lengths:?}: differs from steps: {differences:?}");
-        if worst > ROUNDING {
-            tolerance = ROUNDING;
+        let more = random(6, WIDTH);
+        let inputs = Tensor::cat(&[sequence, &more], 0);
+        let stepped = by_steps(&inputs, initial(), step).0;
+        for (form, (output, state)) in
+            [("scan", (output, state)), ("act", by_steps(sequence, initial(), |x, state| memory.act(x, state)))]
+        {
+            let output = Tensor::cat(&[output, by_steps(&more, state, step).0], 0);
+            let difference = difference(&output, &stepped);
+            let explained = || name == "dnc" && begins_at_a_crossing(memory, &inputs, &output, &stepped);
+            let steps = sequence.size()[0];
+            assert!(
+                difference <= ROUNDING || explained(),
+                "{name}, {steps} of {lengths:?}: {form} differs from steps by {difference:e}"
+            );
         }
     }
 }
