@@ -74,6 +74,26 @@ macro_rules! widest {
 }
 pub(super) use widest;
 
+/// `f(&mut x[i], &mut y[i], z[i])`, a block at a time: for parts of rows that lie side by side. A plain loop over them, within
+/// a loop over rows, is compiled with one check for all rows whether what is written overlaps what is read; parts of
+/// different rows do, so that it would run number by number.
+#[inline(always)]
+pub(super) fn in_blocks(x: &mut [f32], y: &mut [f32], z: &[f32], f: impl Fn(&mut f32, &mut f32, f32)) {
+    const BLOCK: usize = 16;
+    let ((x, x_rest), (y, y_rest)) = (x.as_chunks_mut::<BLOCK>(), y.as_chunks_mut::<BLOCK>());
+    let (z, z_rest) = z.as_chunks::<BLOCK>();
+    for ((x, y), z) in x.iter_mut().zip(y).zip(z) {
+        let (mut new_x, mut new_y) = (*x, *y);
+        for ((x, y), z) in new_x.iter_mut().zip(&mut new_y).zip(z) {
+            f(x, y, *z);
+        }
+        (*x, *y) = (new_x, new_y);
+    }
+    for ((x, y), z) in x_rest.iter_mut().zip(y_rest).zip(z_rest) {
+        f(x, y, *z);
+    }
+}
+
 /// `1 / (1 + exp(-x))`, within 2e-7.
 #[inline(always)]
 pub(super) fn sigmoid(x: f32) -> f32 {

@@ -12,7 +12,7 @@
 // Only inlined code is compiled for the caller's instruction set.
 #![allow(clippy::inline_always)]
 
-use super::elementwise::{sigmoid, tanh};
+use super::elementwise::{in_blocks, sigmoid, tanh};
 use super::recurrent_cpu::{Backward, Cell, Forward};
 
 /// Gates in the order r, q, n.
@@ -38,9 +38,7 @@ impl Cell for GruCell {
             for (m, c) in m.iter_mut().zip(c_n) {
                 *m += c;
             }
-            for ((n, m), r) in n.iter_mut().zip(m).zip(r) {
-                *n = tanh(*n + r * *m);
-            }
+            in_blocks(n, m, r, |n, m, r| *n = tanh(*n + r * *m));
             for (((next, h), n), q) in next.iter_mut().zip(h).zip(n).zip(q) {
                 *next = *n + q * (h - *n);
             }
@@ -63,16 +61,14 @@ impl Cell for GruCell {
                 for ((((dq, dh), h), n), q) in dq.iter_mut().zip(&*dh).zip(h).zip(&*n).zip(q) {
                     *dq = dh * (h - n) * (q * (1.0 - q));
                 }
-                for ((n, dh), q) in n.iter_mut().zip(&*dh).zip(q) {
-                    *n = dh * (1.0 - q) * (1.0 - *n * *n);
-                }
+                in_blocks(n, dh, q, |n, dh, q| *n = *dh * (1.0 - q) * (1.0 - *n * *n));
                 let dn = n;
-                for (((dr, dn), m), r) in dr.iter_mut().zip(&*dn).zip(&*m).zip(r) {
-                    *dr = dn * m * (r * (1.0 - r));
-                }
-                for ((m, dn), r) in m.iter_mut().zip(&*dn).zip(r) {
-                    *m = dn * r;
-                }
+                dr.copy_from_slice(r);
+                in_blocks(dr, m, dn, |r, m, dn| {
+                    let ds = dn * *r;
+                    *r = dn * *m * (*r * (1.0 - *r));
+                    *m = ds;
+                });
                 for (dh, q) in dh.iter_mut().zip(q) {
                     *dh *= q;
                 }

@@ -175,6 +175,13 @@ impl Memory for Lmu {
         (h.shallow_clone(), State(vec![h, m]))
     }
 
+    fn act(&self, input: &Tensor, state: &State) -> (Tensor, State) {
+        if !on_cpu(input) {
+            return tch::no_grad(|| self.step(input, state));
+        }
+        lmu_cpu::act(&self.parameters, input, state)
+    }
+
     fn scan(&self, input: &Tensor, packing: &Packing, state: &State) -> Scan {
         if !on_cpu(input) {
             return scan_by_steps(self, input, packing, state);

@@ -35,8 +35,6 @@ pub(super) fn scan(parameters: &Parameters, input: &Tensor, packing: &Packing, i
         let (memory, hidden) = (parameters.window.size()[0], parameters.weight_state.size()[0]);
         let p = parameters;
         let g = combined(p);
-        // Not copied: products with a transposed view add up in another order, and are several times as accurate.
-        let [window, w_h, w_m] = [&p.window, &p.weight_state, &p.weight_memory].map(Tensor::tr);
         let v = Trajectory::new(packing, &Tensor::cat(&[&initial.0[1], &initial.0[0]], 1));
         let _ = v.after().narrow(1, 0, memory).zero_();
         v.after().narrow(1, memory, hidden).copy_(&input.mm(&parameters.weight_input.tr()));
@@ -45,10 +43,8 @@ pub(super) fn scan(parameters: &Parameters, input: &Tensor, packing: &Packing, i
         for step in &steps {
             let (before, after) = (v.before(step), v.after_step(step));
             let (m, h) = (before.narrow(1, 0, memory), before.narrow(1, memory, hidden));
-            let (mut next_m, mut next_h) = (after.narrow(1, 0, memory), after.narrow(1, memory, hidden));
-            let u = narrow(&u, &step.now) + dot(&h, &p.encoder_state) + dot(&m, &p.encoder_memory);
-            let _ = next_m.addmm_(&m, &window).addmm_(&u, &p.window_input);
-            let _ = next_h.addmm_(&h, &w_h).addmm_(&next_m, &w_m).tanh_();
+            let next = (after.narrow(1, 0, memory), after.narrow(1, memory, hidden));
+            advance(p, &narrow(&u, &step.now), (&m, &h), next);
         }
         let output = v.after().narrow(1, memory, hidden).contiguous();
         let last = v.after().index_select(0, &packing.last_rows());
@@ -59,6 +55,25 @@ pub(super) fn scan(parameters: &Parameters, input: &Tensor, packing: &Packing, i
         });
         Scan { output, state, computed_steps: packing.rows(), backward }
     })
+}
+
+/// One time step, without gradients.
+pub(super) fn act(p: &Parameters, input: &Tensor, state: &State) -> (Tensor, State) {
+    tch::no_grad(|| {
+        let (h, m) = (&state.0[0], &state.0[1]);
+        let (next_m, next_h) = (m.zeros_like(), input.mm(&p.weight_input.tr()));
+        advance(p, &dot(input, &p.encoder_input), (m, h), (next_m.shallow_clone(), next_h.shallow_clone()));
+        (next_h.shallow_clone(), State(vec![next_h, next_m]))
+    })
+}
+
+/// From m and h to m', which is 0 before, and h', which is W_x x before; `u` is e_x . x.
+fn advance(p: &Parameters, u: &Tensor, (m, h): (&Tensor, &Tensor), (mut next_m, mut next_h): (Tensor, Tensor)) {
+    // Not copied: products with a transposed view add up in another order, and are several times as accurate.
+    let [window, w_h, w_m] = [&p.window, &p.weight_state, &p.weight_memory].map(Tensor::tr);
+    let u = u + dot(h, &p.encoder_state) + dot(m, &p.encoder_memory);
+    let _ = next_m.addmm_(m, &window).addmm_(&u, &p.window_input);
+    let _ = next_h.addmm_(h, &w_h).addmm_(&next_m, &w_m).tanh_();
 }
 
 /// `e . x` of each row, as in `lmu.rs`.

@@ -12,7 +12,7 @@
 // Only inlined code is compiled for the caller's instruction set.
 #![allow(clippy::inline_always)]
 
-use super::elementwise::{sigmoid, tanh};
+use super::elementwise::{in_blocks, sigmoid, tanh};
 use super::recurrent_cpu::{Backward, Cell, Forward};
 
 /// Gates in the order i, f, g, o.
@@ -78,9 +78,7 @@ impl Cell for LstmCell {
             for (((di, dcell), g), i) in di.iter_mut().zip(&*dcell).zip(&*g).zip(&*i) {
                 *di = dcell * g * (i * (1.0 - i));
             }
-            for ((g, dcell), i) in g.iter_mut().zip(&*dcell).zip(&*i) {
-                *g = dcell * i * (1.0 - *g * *g);
-            }
+            in_blocks(g, dcell, i, |g, dcell, i| *g = *dcell * i * (1.0 - *g * *g));
             for (((df, dcell), cell), f) in df.iter_mut().zip(&*dcell).zip(cell).zip(&*f) {
                 *df = dcell * cell * (f * (1.0 - f));
             }

@@ -17,7 +17,7 @@
 
 use tch::{Kind, Tensor};
 
-use super::elementwise::{floats, floats_mut, sigmoid, widest};
+use super::elementwise::{floats, floats_mut, in_blocks, sigmoid, widest};
 use super::s4d_block_cpu::{
     Columns, Forward, LANES, Lanes, Reverse, STEPS, Stretch, System, backward, copy_lanes, forward,
 };
@@ -193,12 +193,12 @@ widest! {
 fn glu_backward_rows(z: &mut [f32], grad: &[f32], hidden: usize) {
     for (z, grad) in z.chunks_exact_mut(2 * hidden).zip(grad.chunks_exact(hidden)) {
         let (p, q) = z.split_at_mut(hidden);
-        for ((p, q), grad) in p.iter_mut().zip(q).zip(grad) {
+        in_blocks(p, q, grad, |p, q, grad| {
             let gate = sigmoid(*q);
             let through = grad * gate;
             *q = through * *p * (1.0 - gate);
             *p = through;
-        }
+        });
     }
 }
 
