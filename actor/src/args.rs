@@ -1,6 +1,7 @@
 //! The command line.
 
 use std::net::SocketAddr;
+use std::path::PathBuf;
 
 use popgym_proto::{limits, transport};
 
@@ -10,9 +11,25 @@ use popgym_proto::{limits, transport};
 #[derive(Clone, Debug, clap::Parser)]
 #[command(name = "actor", version)]
 pub struct Args {
-    /// Where the learner listens, for example http://gpu-box:5555
+    /// Where the learner listens, for example http://gpu-box:5555; https:// where it has TLS
     #[arg(long, env = "POPGYM_LEARNER", value_name = "URL", value_parser = learner_url)]
     pub learner: String,
+
+    /// File of the token that the learner wants to see
+    #[arg(long, env = "POPGYM_TOKEN_FILE", value_name = "FILE")]
+    pub token_file: Option<PathBuf>,
+
+    /// File of the CA that signed the learner's certificate, PEM; needed for https://
+    #[arg(long, env = "POPGYM_TLS_CA", value_name = "FILE")]
+    pub tls_ca: Option<PathBuf>,
+
+    /// File of this actor's own certificate, PEM, where the learner wants one
+    #[arg(long, env = "POPGYM_TLS_CERTIFICATE", value_name = "FILE", requires = "tls_key")]
+    pub tls_certificate: Option<PathBuf>,
+
+    /// File of its private key, PEM
+    #[arg(long, env = "POPGYM_TLS_KEY", value_name = "FILE", requires = "tls_certificate")]
+    pub tls_key: Option<PathBuf>,
 
     /// Episodes stepped at a time, on one core
     #[arg(long, env = "POPGYM_SLOTS", value_name = "N", default_value_t = 128, value_parser = clap::value_parser!(u32).range(1..=i64::from(limits::MAX_SLOTS)))]
@@ -43,16 +60,37 @@ pub struct Args {
     pub nice: i32,
 }
 
+impl Args {
+    /// Checks what the flags must be together.
+    ///
+    /// # Errors
+    /// The flag that is missing or has no use.
+    pub fn validate(&self) -> Result<(), String> {
+        match (self.learner.starts_with("https://"), &self.tls_ca) {
+            (true, None) => Err(format!(
+                "--learner is {}, which needs --tls-ca: the file of the CA that signed the learner's certificate",
+                self.learner
+            )),
+            (false, _) if self.tls_ca.is_some() || self.tls_certificate.is_some() => Err(format!(
+                "--learner is {}, allowed with --tls-ca or --tls-certificate is https://HOST:PORT",
+                self.learner
+            )),
+            _ => Ok(()),
+        }
+    }
+}
+
 /// A URL, `http://` added where no scheme is given.
 fn learner_url(text: &str) -> Result<String, String> {
     let url = if text.contains("://") { text.to_owned() } else { format!("http://{text}") };
-    if !url.starts_with("http://") {
-        return Err("expected http://HOST:PORT (there is no TLS; use a private network or a tunnel)".to_owned());
+    if !url.starts_with("http://") && !url.starts_with("https://") {
+        return Err("expected http://HOST:PORT or https://HOST:PORT".to_owned());
     }
-    let endpoint = transport::endpoint(&url).map_err(|_| "expected http://HOST:PORT".to_owned())?;
+    let endpoint =
+        transport::endpoint(&url).map_err(|_| "expected http://HOST:PORT or https://HOST:PORT".to_owned())?;
     match endpoint.uri().port() {
         Some(_) => Ok(url),
-        None => Err("the port is missing: expected http://HOST:PORT".to_owned()),
+        None => Err("the port is missing: expected http://HOST:PORT or https://HOST:PORT".to_owned()),
     }
 }
 
@@ -86,9 +124,21 @@ mod tests {
     fn a_learner_is_an_http_url_with_a_port() {
         assert_eq!(parse(&["--learner", "box:5555"]).unwrap().learner, "http://box:5555");
         assert_eq!(parse(&["--learner", "http://[::1]:5555"]).unwrap().learner, "http://[::1]:5555");
-        for wrong in ["https://box:5555", "http://box", "http://b x:1", ""] {
+        assert_eq!(parse(&["--learner", "https://box:5555"]).unwrap().learner, "https://box:5555");
+        for wrong in ["ftp://box:5555", "http://box", "https://box", "http://b x:1", ""] {
             assert_eq!(parse(&["--learner", wrong]).unwrap_err().exit_code(), 2, "{wrong}");
         }
+    }
+
+    #[test]
+    fn tls_and_its_files_go_together() {
+        let valid = |args: &[&str]| parse(args).unwrap().validate();
+        assert_eq!(valid(&["--learner", "https://box:5555", "--tls-ca", "ca.pem"]), Ok(()));
+        assert!(valid(&["--learner", "https://box:5555"]).unwrap_err().contains("needs --tls-ca"));
+        assert!(
+            valid(&["--learner", "http://box:5555", "--tls-ca", "ca.pem"]).unwrap_err().contains("https://HOST:PORT")
+        );
+        assert!(parse(&["--learner", "https://box:5555", "--tls-ca", "a", "--tls-key", "b"]).is_err());
     }
 
     #[test]

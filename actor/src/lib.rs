@@ -4,6 +4,7 @@
 //! |---|---|
 //! | [`args`] | the command line |
 //! | [`session`] | one connection: hello, welcome, ready, then epochs and leases in, episodes out |
+//! | [`door`] | the way to the learner: address, TLS, token |
 //! | [`backoff`] | how long to wait before the next attempt |
 //! | [`worker`] | the thread of libtorch: takes what the session hears, hands back episodes |
 //! | [`rollout`] | the hot loop: slots, rows, one step of all live episodes |
@@ -27,6 +28,7 @@ use tracing_subscriber::EnvFilter;
 
 pub mod args;
 pub mod backoff;
+pub mod door;
 pub mod invariance;
 pub mod metrics;
 pub mod rollout;
@@ -61,6 +63,10 @@ pub fn run(
             return ExitCode::from(u8::try_from(usage.exit_code()).unwrap_or(2));
         }
     };
+    if let Err(problem) = args.validate() {
+        eprintln!("error: {problem}");
+        return ExitCode::from(2);
+    }
     let filter = EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new("info"));
     // Fails only where the caller has set up logging already, which is then what it wants.
     let _ = tracing_subscriber::fmt()
@@ -103,7 +109,7 @@ async fn stay_connected(args: &Args, worker: &Worker) -> anyhow::Result<()> {
     let mut backoff = Backoff::new(BACKOFF.0, BACKOFF.1)?;
     let (mut give_up_at, mut announced) = (Instant::now() + patience, false);
     loop {
-        let (reason, welcomed) = match session::run(&args.learner, identity.hello(), worker).await {
+        let (reason, welcomed) = match session::run(args, identity.hello(), worker).await {
             End::Complete(reason) => {
                 info!("run complete: {reason}");
                 return Ok(());

@@ -6,9 +6,10 @@ use popgym_proto::{ActorMessage, Hello, LearnerMessage, PROTOCOL_VERSION, RunSpe
 use tokio::sync::{mpsc, oneshot};
 use tokio::time::{MissedTickBehavior, interval, timeout};
 use tokio_stream::wrappers::ReceiverStream;
-use tonic::{Code, Status, Streaming};
+use tonic::{Code, Request, Status, Streaming};
 
 use crate::args::Args;
+use crate::door::{Door, innermost};
 use crate::worker::{Command, Output, Worker};
 
 /// How a session ended.
@@ -65,10 +66,14 @@ impl Identity {
 }
 
 /// One session, from connecting to its end.
-pub async fn run(url: &str, hello: Hello, worker: &Worker) -> End {
+pub async fn run(args: &Args, hello: Hello, worker: &Worker) -> End {
     let expected_run = hello.run.clone();
     let (to_learner, requests) = mpsc::channel(limits::STREAM_QUEUE);
-    let mut replies = match connect(url, hello, &to_learner, requests).await {
+    let door = match Door::new(args) {
+        Ok(door) => door,
+        Err(problem) => return End::Failed(problem),
+    };
+    let mut replies = match connect(door, hello, &to_learner, requests).await {
         Ok(replies) => replies,
         Err(status) => return ended(&status, false),
     };
@@ -90,17 +95,20 @@ pub async fn run(url: &str, hello: Hello, worker: &Worker) -> End {
 
 /// Connects and says hello.
 async fn connect(
-    url: &str,
+    door: Door,
     hello: Hello,
     to_learner: &mpsc::Sender<wire::FromActor>,
     requests: mpsc::Receiver<wire::FromActor>,
 ) -> Result<Streaming<wire::FromLearner>, Status> {
-    let unavailable = |error: tonic::transport::Error| Status::unavailable(innermost(&error));
-    let channel = transport::endpoint(url).map_err(unavailable)?.connect().await.map_err(unavailable)?;
+    let channel = door.endpoint.connect().await.map_err(|error| Status::unavailable(innermost(&error)))?;
     // The queue is empty and holds at least one.
     to_learner.try_send(ActorMessage::Hello(hello).into_wire()).map_err(|error| Status::internal(error.to_string()))?;
     let mut client = transport::client(channel);
-    let answer = timeout(limits::HELLO_DEADLINE, client.session(ReceiverStream::new(requests))).await;
+    let mut request = Request::new(ReceiverStream::new(requests));
+    if let Some(token) = door.token {
+        token.put(request.metadata_mut());
+    }
+    let answer = timeout(limits::HELLO_DEADLINE, client.session(request)).await;
     Ok(answer.map_err(|_| Status::unavailable("no answer"))??.into_inner())
 }
 
@@ -202,7 +210,7 @@ async fn next(replies: &mut Streaming<wire::FromLearner>, welcomed: bool) -> Res
 /// What a status means: refusals are final, all else may pass.
 fn ended(status: &Status, welcomed: bool) -> End {
     match status.code() {
-        Code::InvalidArgument | Code::FailedPrecondition => {
+        Code::InvalidArgument | Code::FailedPrecondition | Code::Unauthenticated => {
             End::Failed(format!("refused by the learner: {}", status.message()))
         }
         Code::Unimplemented => End::Failed("whoever listens there is not a learner of popgym-rs".to_owned()),
@@ -216,13 +224,4 @@ fn ended(status: &Status, welcomed: bool) -> End {
 
 fn worker_died() -> End {
     End::Failed("the rollout thread has died".to_owned())
-}
-
-/// The cause at the bottom, which is the one that says something ("connection refused").
-fn innermost(error: &dyn std::error::Error) -> String {
-    let mut cause = error;
-    while let Some(next) = cause.source() {
-        cause = next;
-    }
-    cause.to_string()
 }

@@ -4,7 +4,7 @@
 //! file's table goes over it, and the flags' over both.
 
 use std::net::SocketAddr;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use anyhow::{Context, bail};
 use popgym_envs::{EnvSpec, Observability};
@@ -13,6 +13,8 @@ use popgym_proto::RunSpec;
 use serde::{Deserialize, Serialize};
 use tch::Device;
 use toml::{Table, Value};
+
+use crate::service::TlsFiles;
 
 pub use crate::ppo_keys::{LearningRateSchedule, Ppo, PpoFlags};
 
@@ -78,6 +80,44 @@ pub struct ServiceConfig {
     pub listen: String,
     /// Address for Prometheus; empty: none.
     pub metrics_listen: String,
+    /// File of the token that actors must show; empty: none.
+    pub token_file: String,
+    /// File of the learner's certificate (PEM); empty: no TLS.
+    pub tls_certificate: String,
+    /// File of its private key.
+    pub tls_key: String,
+    /// File of the CA that signs actors' certificates; empty: they need none.
+    pub tls_client_ca: String,
+    /// Listen beyond this machine even without TLS or a token.
+    pub insecure: bool,
+}
+
+impl ServiceConfig {
+    /// The learner's certificate, if it has one.
+    pub fn tls(&self) -> Option<TlsFiles> {
+        let file = |path: &str| (!path.is_empty()).then(|| PathBuf::from(path));
+        let (certificate, key) = (file(&self.tls_certificate)?, PathBuf::from(&self.tls_key));
+        Some(TlsFiles { certificate, key, client_ca: file(&self.tls_client_ca) })
+    }
+
+    /// The file of the token, if there is one.
+    pub fn token(&self) -> Option<PathBuf> {
+        (!self.token_file.is_empty()).then(|| PathBuf::from(&self.token_file))
+    }
+
+    fn validate_tls(&self) -> anyhow::Result<()> {
+        if self.tls_certificate.is_empty() != self.tls_key.is_empty() {
+            bail!(
+                "service.tls_certificate is `{}` and service.tls_key is `{}`, allowed are both or neither",
+                self.tls_certificate,
+                self.tls_key
+            );
+        }
+        if self.tls_certificate.is_empty() && !self.tls_client_ca.is_empty() {
+            bail!("service.tls_client_ca is `{}`, allowed only with service.tls_certificate", self.tls_client_ca);
+        }
+        Ok(())
+    }
 }
 
 /// What episodes are played for.
@@ -252,6 +292,7 @@ impl Config {
         if !metrics_listen.is_empty() && metrics_listen.parse::<SocketAddr>().is_err() {
             bail!("service.metrics_listen is `{metrics_listen}`, allowed is IP:PORT");
         }
+        self.service.validate_tls()?;
         if self.stop_at_mmer.is_some_and(f64::is_nan) {
             bail!("stop_at_mmer is NaN, allowed is a number");
         }
@@ -302,6 +343,11 @@ fn preset_table(name: &str, env: &EnvSpec) -> anyhow::Result<Table> {
             actor_command: Vec::new(),
             listen: String::new(),
             metrics_listen: String::new(),
+            token_file: String::new(),
+            tls_certificate: String::new(),
+            tls_key: String::new(),
+            tls_client_ca: String::new(),
+            insecure: false,
         },
         memory: Table::from_iter([("name".to_owned(), Value::String("gru".to_owned()))]),
         policy: PolicyOptions { log_std_min: log_std.0, log_std_max: log_std.1 },

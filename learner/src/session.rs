@@ -11,9 +11,9 @@ use rand::Rng as _;
 use tch::Device;
 
 use crate::Extensions;
-use crate::config::{self, Config};
+use crate::config::{self, Config, ServiceConfig};
 use crate::local_actors::{ActorCommand, Hopeless, LocalActors};
-use crate::service::Service;
+use crate::service::{Entrance, Service};
 
 /// One learner at work, with its actors.
 pub struct Session<'a> {
@@ -29,7 +29,8 @@ pub struct Session<'a> {
     stored_action: Space,
     /// How local actors are started where the configuration does not say it.
     actor_command: Vec<String>,
-    listener: Option<TcpListener>,
+    /// The first is for remote actors; the second, if there is one, for local ones.
+    entrances: Vec<Entrance>,
     service: Option<Service>,
     actors: Option<LocalActors>,
 }
@@ -55,7 +56,7 @@ impl<'a> Session<'a> {
             signature: policy.signature(),
             stored_action: policy.distribution().stored_space(),
             actor_command: extensions.actor_command.clone(),
-            listener: None,
+            entrances: Vec::new(),
             service: None,
             actors: None,
         })
@@ -110,8 +111,14 @@ impl<'a> Session<'a> {
             ("", _) => "127.0.0.1:0",
             (address, _) => address,
         };
-        let listener = TcpListener::bind(listen).with_context(|| format!("cannot listen for actors on {listen}"))?;
-        self.listener = Some(listener);
+        let bind = |listen| TcpListener::bind(listen).with_context(|| format!("cannot listen for actors on {listen}"));
+        let entrance = Entrance { listener: bind(listen)?, tls: service.tls() };
+        check_exposure(&entrance, service)?;
+        self.entrances.push(entrance);
+        if service.tls().is_some() && service.actors > 0 {
+            // Local actors need no certificate, and the learner's need not be for this machine's own address.
+            self.entrances.push(Entrance { listener: bind("127.0.0.1:0")?, tls: None });
+        }
         if service.metrics_listen.is_empty() { Ok(()) } else { serve_metrics(&service.metrics_listen) }
     }
 
@@ -120,11 +127,11 @@ impl<'a> Session<'a> {
     /// # Errors
     /// As [`Session::listen`], if that was not called before; or the actors cannot be started.
     pub fn serve(&mut self, run: &str, purpose: config::Purpose) -> anyhow::Result<()> {
-        if self.listener.is_none() {
+        if self.entrances.is_empty() {
             self.listen()?;
         }
-        let listener = self.listener.take().context("no listening address")?;
-        let address = listener.local_addr()?;
+        let entrances = std::mem::take(&mut self.entrances);
+        let local = entrances.last().context("no listening address")?.listener.local_addr()?;
         let spec = self.config.run_spec(run, purpose)?;
         let episodes = EpisodeSpec {
             observation: self.env.observation.clone(),
@@ -132,24 +139,28 @@ impl<'a> Session<'a> {
             max_steps: self.env.max_steps.min(self.config.max_episode_steps),
         };
         let fingerprint = fingerprint(&spec, &format!("{:?}", self.env), &self.signature);
-        self.service = Some(Service::start(listener, spec, episodes, fingerprint)?);
         let service = &self.config.service;
+        self.service = Some(Service::start(entrances, service.token(), spec, episodes, fingerprint)?);
         if service.actors > 0 {
             let mut args = vec![
                 "--learner".to_owned(),
-                format!("http://{address}"),
+                format!("http://{local}"),
                 "--run".to_owned(),
                 run.to_owned(),
                 "--slots".to_owned(),
                 service.slots.to_string(),
             ];
+            if !service.token_file.is_empty() {
+                args.extend(["--token-file".to_owned(), service.token_file.clone()]);
+            }
             if self.config.lag == 1 {
                 // They sample while the learner learns on the same cores: they get what it leaves.
                 args.extend(["--nice".to_owned(), "19".to_owned()]);
             }
             self.actors = Some(LocalActors::spawn(service.actors as usize, self.actor_command()?.with(args))?);
         } else {
-            tracing::info!("waiting for actors: actor --learner http://{address}");
+            let scheme = if service.tls().is_some() { "https" } else { "http" };
+            tracing::info!("waiting for actors: actor --learner {scheme}://{local}");
         }
         Ok(())
     }
@@ -182,6 +193,24 @@ impl<'a> Session<'a> {
             actors.stop();
         }
     }
+}
+
+/// Refuses to let strangers in by accident.
+fn check_exposure(entrance: &Entrance, service: &ServiceConfig) -> anyhow::Result<()> {
+    let address = entrance.listener.local_addr()?;
+    if address.ip().to_canonical().is_loopback() || (entrance.tls.is_some() && !service.token_file.is_empty()) {
+        return Ok(());
+    }
+    anyhow::ensure!(
+        service.insecure,
+        "service.listen is `{}`, which other machines reach: allowed with tls_certificate, tls_key and token_file, or with \
+         `insecure` on a network whose every user you trust",
+        service.listen
+    );
+    tracing::warn!(
+        "listening on {address} without TLS or without a token: whoever reaches it can read and change this run"
+    );
+    Ok(())
 }
 
 fn serve_metrics(address: &str) -> anyhow::Result<()> {

@@ -6,6 +6,7 @@
 //! | [`message`] | the two directions of a session: [`ActorMessage`], [`LearnerMessage`] |
 //! | [`run`] | [`RunSpec`], [`Hello`], and the fingerprint by which both sides know that they build the same policy |
 //! | [`episode`] | [`Episode`], checked against an [`EpisodeSpec`]; [`EpisodeBuilder`] for who samples it |
+//! | [`token`] | the secret that actors show |
 //! | [`transport`] | channel and server settings, the same care on both sides |
 //! | [`wire`] | the generated code; nothing outside this crate reads its fields |
 //!
@@ -17,6 +18,7 @@ pub mod error;
 pub mod limits;
 pub mod message;
 pub mod run;
+pub mod token;
 pub mod transport;
 
 #[allow(missing_docs, unreachable_pub, clippy::all, clippy::pedantic)]
@@ -29,6 +31,7 @@ pub use episode::{Columns, Episode, EpisodeBatch, EpisodeBuilder, EpisodeSpec};
 pub use error::WireError;
 pub use message::{ActorMessage, LearnerMessage, Leases, OpenEpoch, WeightSet};
 pub use run::{Fingerprint, Hello, RunSpec, fingerprint};
+pub use token::Token;
 
 /// Grows with every change after which an older actor and a newer learner would misunderstand each other.
 pub const PROTOCOL_VERSION: u32 = 2;

@@ -52,6 +52,15 @@ pub const MAX_REASON_CHARS: usize = 1024;
 /// Most actors of one learner.
 pub const MAX_SESSIONS: usize = 1024;
 
+/// Most connections of one learner: all actors, and as many again that come and go or only ask for its health.
+pub const MAX_CONNECTIONS: usize = 2 * MAX_SESSIONS;
+
+/// Most connections from one address that have not said a legal hello. They are dropped after [`HELLO_DEADLINE`].
+pub const MAX_STRANGERS: usize = 256;
+
+/// A peer whose TLS handshake takes longer is dropped.
+pub const TLS_DEADLINE: Duration = Duration::from_secs(5);
+
 /// A TCP connection that is not there after this long has failed.
 pub const CONNECT_DEADLINE: Duration = Duration::from_secs(5);
 

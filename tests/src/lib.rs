@@ -6,6 +6,7 @@
 //! | [`process`] | one `learner` or `actor`: start, signals, log, end |
 //! | [`scene`] | a temporary directory with a tiny configuration, and the runs in it |
 //! | [`terminal`] | a program on a terminal of its own: keys in, the screen out |
+//! | [`authority`] | certificates |
 //! | [`net`] | a free port, a plain HTTP request, the health service |
 //!
 //! Every wait has the same generous deadline: it only tells a test that hangs from one on a busy machine.
@@ -13,11 +14,13 @@
 
 use std::time::{Duration, Instant};
 
+pub mod authority;
 pub mod net;
 pub mod process;
 pub mod scene;
 pub mod terminal;
 
+pub use authority::Authority;
 pub use process::{Outcome, Process, Program};
 pub use scene::Scene;
 pub use terminal::Terminal;

@@ -158,7 +158,7 @@ impl Process {
     /// If there is none within the deadline.
     #[track_caller]
     pub fn url(&mut self) -> String {
-        let line = self.logged("waiting for actors: actor --learner http://");
+        let line = self.logged("waiting for actors: actor --learner http");
         line.split_whitespace().last().expect("the address").to_owned()
     }
 

@@ -5,6 +5,11 @@ use metrics::{counter, describe_counter, describe_gauge, gauge};
 /// Names and explains every metric of the service.
 pub(super) fn describe() {
     describe_gauge!("popgym_learner_actors", "Actors that are connected and ready");
+    describe_gauge!("popgym_learner_connections", "TCP connections, of actors and others");
+    describe_counter!(
+        "popgym_learner_connections_refused_total",
+        "Connections refused, by reason: full, tls, token, deadline (no hello in time)"
+    );
     describe_gauge!("popgym_learner_open_epoch", "Epoch that is being sampled");
     describe_gauge!("popgym_learner_sampling_version", "Version of the weights that sample it");
     describe_gauge!("popgym_learner_lag_epochs", "Open epoch minus the version that samples it");
@@ -25,6 +30,14 @@ pub(super) fn describe() {
 
 pub(super) fn actors(count: usize) {
     gauge!("popgym_learner_actors").set(count as f64);
+}
+
+pub(super) fn connections(count: usize) {
+    gauge!("popgym_learner_connections").set(count as f64);
+}
+
+pub(super) fn connection_refused(reason: &'static str) {
+    counter!("popgym_learner_connections_refused_total", "reason" => reason).increment(1);
 }
 
 pub(super) fn opened(epoch: u64, version: u64) {

@@ -2,6 +2,8 @@
 //!
 //! | module | what it holds |
 //! |---|---|
+//! | `connections` | who may connect, how many, and how long without a word |
+//! | `tls` | the learner's certificate, and its actors' |
 //! | `session` | one actor: handshake, checks, deadlines |
 //! | `coordinator` | the single owner of sessions, leases and episodes |
 //! | [`planner`] | how many leases, and to whom (pure) |
@@ -12,6 +14,7 @@
 
 use std::cell::Cell;
 use std::net::{SocketAddr, TcpListener};
+use std::path::PathBuf;
 use std::pin::Pin;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -20,20 +23,27 @@ use std::time::Duration;
 
 use anyhow::Context as _;
 use bytes::Bytes;
-use popgym_proto::{Episode, EpisodeSpec, Fingerprint, RunSpec, WeightSet, limits, transport, wire};
+use popgym_proto::{Episode, EpisodeSpec, Fingerprint, RunSpec, Token, WeightSet, limits, transport, wire};
 use tokio::sync::{Semaphore, mpsc, oneshot};
 use tokio_stream::Stream;
 use tokio_stream::wrappers::ReceiverStream;
+use tonic::service::interceptor::InterceptedService;
 use tonic::{Request, Response, Status, Streaming};
 
+mod connections;
 mod coordinator;
 mod metrics;
 pub mod planner;
+mod reloaded;
 mod session;
+mod tls;
 
 pub use planner::Target;
+pub use tls::TlsFiles;
 
+use connections::{Gate, Peer};
 use coordinator::{Coordinator, Event, Shared};
+use reloaded::Reloaded;
 use session::Terms;
 
 /// Threads of the network. One serves hundreds of actors; the second keeps heartbeats going while the first checks a
@@ -62,6 +72,15 @@ pub struct Collected {
     pub seconds: f64,
 }
 
+/// Where actors connect.
+#[derive(Debug)]
+pub struct Entrance {
+    /// The socket.
+    pub listener: TcpListener,
+    /// `None`: without TLS.
+    pub tls: Option<TlsFiles>,
+}
+
 /// A running service.
 pub struct Service {
     runtime: tokio::runtime::Runtime,
@@ -74,12 +93,15 @@ pub struct Service {
 }
 
 impl Service {
-    /// Serves actors on `listener`. `episodes` is what their episodes look like, `fingerprint` what they must build.
+    /// Serves actors at `entrances`, of which there is at least one; all of them show the token in `token_file`, if that is
+    /// given. `episodes` is what their episodes look like, `fingerprint` what they must build.
     ///
     /// # Errors
-    /// Specifications beyond the wire's limits, or a system that refuses threads or the socket.
+    /// Specifications beyond the wire's limits, certificates or a token that cannot be read, or a system that refuses threads
+    /// or the socket.
     pub fn start(
-        listener: TcpListener,
+        entrances: Vec<Entrance>,
+        token_file: Option<PathBuf>,
         spec: RunSpec,
         episodes: EpisodeSpec,
         fingerprint: Fingerprint,
@@ -92,8 +114,8 @@ impl Service {
             .thread_name("network")
             .enable_all()
             .build()?;
-        let address = listener.local_addr()?;
-        listener.set_nonblocking(true)?;
+        let address = entrances.first().context("no listening address")?.listener.local_addr()?;
+        let token = token_file.map(load_token).transpose()?;
         let (events, inbox) = mpsc::channel(limits::COORDINATOR_QUEUE);
         let (results_in, results) = std::sync::mpsc::channel();
         let shared = Arc::new(Shared::default());
@@ -104,12 +126,19 @@ impl Service {
             permits: Arc::new(Semaphore::new(limits::MAX_SESSIONS)),
             sessions: AtomicU64::new(0),
         };
-        let listener = runtime.block_on(async { tokio::net::TcpListener::from_std(listener) })?;
+        let (accepted, connections) = mpsc::channel(limits::STREAM_QUEUE);
+        let gate = Arc::new(Gate::default());
+        for Entrance { listener, tls } in entrances {
+            let tls = tls.map(TlsFiles::load).transpose()?;
+            runtime.spawn(connections::accept(listener, tls, gate.clone(), accepted.clone()));
+        }
         runtime.spawn(async move {
             let (health, health_service) = tonic_health::server::health_reporter();
             health.set_service_status(wire::learner_server::SERVICE_NAME, tonic_health::ServingStatus::Serving).await;
-            let server = transport::server().add_service(health_service).add_service(transport::service(endpoint));
-            if let Err(error) = server.serve_with_incoming(transport::incoming(listener)).await {
+            let authorise = move |request| authorise(token.as_deref(), request);
+            let service = InterceptedService::new(transport::service(endpoint), authorise);
+            let server = transport::server().add_service(health_service).add_service(service);
+            if let Err(error) = server.serve_with_incoming(ReceiverStream::new(connections)).await {
                 tracing::error!("the service for actors has ended: {error}");
             }
         });
@@ -169,6 +198,29 @@ impl Service {
     }
 }
 
+fn load_token(file: PathBuf) -> anyhow::Result<Arc<Reloaded<Token>>> {
+    let token =
+        Reloaded::new("the token file", vec![file.clone()], move || Token::read(&file).map_err(anyhow::Error::msg))?;
+    Ok(Arc::new(token))
+}
+
+/// Refuses a request without the token, before anything of it is read.
+#[allow(clippy::result_large_err)] // tonic's own.
+fn authorise(token: Option<&Reloaded<Token>>, request: Request<()>) -> Result<Request<()>, Status> {
+    if token.is_none_or(|token| token.get().is_in(request.metadata())) {
+        return Ok(request);
+    }
+    let shown = request.metadata().contains_key("authorization");
+    let why = if shown { "the token is not the learner's" } else { "no token was shown" };
+    peer(&request)?.refuse("token", why);
+    Err(Status::unauthenticated(format!("{why}; --token-file names the file that holds it")))
+}
+
+#[allow(clippy::result_large_err)] // tonic's own.
+fn peer<T>(request: &Request<T>) -> Result<Arc<Peer>, Status> {
+    request.extensions().get::<Arc<Peer>>().cloned().ok_or_else(|| Status::internal("a connection without a peer"))
+}
+
 /// The gRPC face.
 struct Endpoint {
     terms: Arc<Terms>,
@@ -185,15 +237,17 @@ impl wire::learner_server::Learner for Endpoint {
         &self,
         request: Request<Streaming<wire::FromActor>>,
     ) -> Result<Response<Self::SessionStream>, Status> {
+        let peer = peer(&request)?;
         let Ok(permit) = self.permits.clone().try_acquire_owned() else {
             let full = format!("this learner has {} actors, which is the most it takes", limits::MAX_SESSIONS);
             return Err(Status::resource_exhausted(full));
         };
         let id = self.sessions.fetch_add(1, Ordering::Relaxed);
         let (replies, stream) = mpsc::channel(limits::STREAM_QUEUE);
-        let serve = session::serve(id, self.terms.clone(), request.into_inner(), replies, self.events.clone());
+        let (terms, events) = (self.terms.clone(), self.events.clone());
         tokio::spawn(async move {
-            serve.await;
+            session::serve(id, &terms, request.into_inner(), &peer, replies, events).await;
+            peer.dismiss();
             drop(permit);
         });
         Ok(Response::new(Box::pin(ReceiverStream::new(stream))))

@@ -1,6 +1,5 @@
 //! One actor's session: handshake, then messages both ways, each with a deadline.
 
-use std::sync::Arc;
 use std::time::Duration;
 
 use popgym_proto::{
@@ -11,6 +10,7 @@ use tokio::sync::{mpsc, oneshot};
 use tokio::time::{MissedTickBehavior, interval, timeout};
 use tonic::{Status, Streaming};
 
+use super::connections::Peer;
 use super::coordinator::Event;
 use super::metrics;
 
@@ -43,12 +43,13 @@ pub(super) type Replies = mpsc::Sender<Result<wire::FromLearner, Status>>;
 /// Serves one stream from its first message to its end, whatever that is.
 pub(super) async fn serve(
     id: u64,
-    terms: Arc<Terms>,
+    terms: &Terms,
     mut requests: Streaming<wire::FromActor>,
+    peer: &Peer,
     replies: Replies,
     events: mpsc::Sender<Event>,
 ) {
-    let hello = match handshake(&terms, &mut requests, &replies).await {
+    let hello = match handshake(terms, &mut requests, peer, &replies).await {
         Ok(hello) => hello,
         Err(status) => {
             metrics::handshake_refused();
@@ -70,7 +71,7 @@ pub(super) async fn serve(
         Err(_) => return refuse(&replies, Status::unavailable("the learner is ending")).await,
     }
     let status = tokio::select! {
-        status = listen(id, &terms, &mut requests, &events) => status,
+        status = listen(id, terms, &mut requests, &events) => status,
         status = speak(orders, &replies) => status,
     };
     let reason = status.message().to_owned();
@@ -88,6 +89,7 @@ async fn refuse(replies: &Replies, status: Status) {
 async fn handshake(
     terms: &Terms,
     requests: &mut Streaming<wire::FromActor>,
+    peer: &Peer,
     replies: &Replies,
 ) -> Result<Hello, Status> {
     let hello = match timeout(limits::HELLO_DEADLINE, next(terms, requests)).await {
@@ -97,6 +99,7 @@ async fn handshake(
         Err(_) => return Err(Status::deadline_exceeded("no hello")),
     };
     check_hello(terms, &hello)?;
+    peer.welcome();
     send(replies, LearnerMessage::Welcome(terms.spec.clone())).await?;
     let ready = async {
         loop {
