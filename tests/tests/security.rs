@@ -2,6 +2,8 @@
 
 use std::io::Read as _;
 use std::net::TcpStream;
+use std::os::unix::fs::PermissionsExt as _;
+use std::process::Command;
 
 use popgym_tests::{Authority, Process, Scene, net, until};
 
@@ -187,4 +189,37 @@ fn files_that_are_not_what_they_should_be() {
         let outcome = scene.actor("https://127.0.0.1:1", &with(&ACTOR, flag, file)).expect(1);
         assert!(outcome.stderr.contains(told), "{told}: {}", outcome.stderr);
     }
+}
+
+#[test]
+fn the_clusters_script_makes_files_that_work() {
+    let scene = Scene::new();
+    let script = concat!(env!("CARGO_MANIFEST_DIR"), "/../deploy/certificates.sh");
+    let made = || {
+        let output =
+            Command::new(script).args(["certs", "localhost", "127.0.0.1"]).current_dir(scene.path(".")).output();
+        let output = output.unwrap();
+        let told = String::from_utf8_lossy(&output.stderr).into_owned();
+        (output.status.code(), String::from_utf8(output.stdout).unwrap(), told)
+    };
+    let (code, said, told) = made();
+    if told.contains("missing: openssl") {
+        eprintln!("skipped: openssl is not installed");
+        return;
+    }
+    assert_eq!((code, said.lines().count()), (Some(0), 4), "{said}{told}");
+    assert_eq!(made(), (Some(0), String::new(), String::new()), "what is there stays");
+    for secret in ["ca.key", "learner.key", "actor.key", "token"] {
+        let mode = std::fs::metadata(scene.path("certs").join(secret)).unwrap().permissions().mode();
+        assert_eq!(mode & 0o077, 0, "{secret} is for its owner alone");
+    }
+    let rename = |flags: &[&str]| -> Vec<String> {
+        let is_file = |flag: &str| flag == "token" || flag.ends_with(".pem") || flag.ends_with(".key");
+        flags.iter().map(|flag| if is_file(flag) { format!("certs/{flag}") } else { (*flag).to_owned() }).collect()
+    };
+    let (learner, actor) = (rename(&LEARNER), rename(&ACTOR));
+    let mut learner = scene.train("run", &learner.iter().map(String::as_str).collect::<Vec<_>>());
+    let url = learner.url().replace("127.0.0.1", "localhost");
+    scene.actor(&url, &actor.iter().map(String::as_str).collect::<Vec<_>>()).expect(0);
+    learner.expect(0);
 }

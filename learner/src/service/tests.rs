@@ -1,5 +1,6 @@
 //! The service against simulated actors over real sockets.
 
+use std::io::{ErrorKind, Read as _, Write as _};
 use std::sync::Mutex;
 use std::time::Instant;
 
@@ -380,4 +381,35 @@ fn the_end_does_not_wait_for_a_batch() {
     assert!(service.collect(|| true).is_none(), "interrupted");
     service.finish("enough");
     assert_eq!(actors.end(sitting).unwrap(), "enough");
+}
+
+#[test]
+fn strangers_have_little_room_and_little_time() {
+    /// How HTTP/2 begins, and nothing after it.
+    const PREFACE: &[u8] = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n\0\0\0\x04\0\0\0\0\0";
+    let service = service();
+    let actors = Actors::of(&service);
+    let _working = actors.spawn("working", Conduct::Honest);
+    wait_for("an actor", || service.actors() == 1);
+    let connect = |i| {
+        let mut stranger = std::net::TcpStream::connect(actors.address).unwrap();
+        if i % 2 == 0 {
+            stranger.write_all(PREFACE).unwrap();
+        }
+        stranger.set_nonblocking(true).unwrap();
+        stranger
+    };
+    let strangers: Vec<_> = (0..limits::MAX_STRANGERS + 20).map(connect).collect();
+    let is_gone = |mut stranger: &std::net::TcpStream| match stranger.read(&mut [0; 1024]) {
+        Ok(read) => read == 0,
+        Err(error) => error.kind() != ErrorKind::WouldBlock,
+    };
+    let gone = || strangers.iter().filter(|stranger| is_gone(stranger)).count();
+    wait_for("those beyond the limit", || gone() == 20);
+    // They are in nobody's way: neither who works already, nor, when their time is up, who comes anew.
+    service.open(0, 0, WEIGHTS, Target::Steps(1_000)).unwrap();
+    assert_eq!(collect(&service).episodes, expected(0, Target::Steps(1_000)));
+    wait_for("the end of the others", || gone() == strangers.len());
+    let _late = actors.spawn("late", Conduct::Honest);
+    wait_for("another actor", || service.actors() == 2);
 }
