@@ -2,6 +2,7 @@
 //! actors, made from a configuration.
 
 use std::net::TcpListener;
+use std::path::Path;
 
 use anyhow::Context;
 use popgym_envs::{EnvSpec, Purpose, Space, stream};
@@ -122,11 +123,11 @@ impl<'a> Session<'a> {
         if service.metrics_listen.is_empty() { Ok(()) } else { serve_metrics(&service.metrics_listen) }
     }
 
-    /// Starts serving actors of the run called `run`, and starts the local ones.
+    /// Starts serving actors of the run called `run`, and starts the local ones. What happens is written to `account`.
     ///
     /// # Errors
     /// As [`Session::listen`], if that was not called before; or the actors cannot be started.
-    pub fn serve(&mut self, run: &str, purpose: config::Purpose) -> anyhow::Result<()> {
+    pub fn serve(&mut self, run: &str, purpose: config::Purpose, account: Option<&Path>) -> anyhow::Result<()> {
         if self.entrances.is_empty() {
             self.listen()?;
         }
@@ -140,7 +141,7 @@ impl<'a> Session<'a> {
         };
         let fingerprint = fingerprint(&spec, &format!("{:?}", self.env), &self.signature);
         let service = &self.config.service;
-        self.service = Some(Service::start(entrances, service.token(), spec, episodes, fingerprint)?);
+        self.service = Some(Service::start(entrances, service.token(), account, spec, episodes, fingerprint)?);
         if service.actors > 0 {
             let mut args = vec![
                 "--learner".to_owned(),

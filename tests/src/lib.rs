@@ -6,6 +6,7 @@
 //! | [`process`] | one `learner` or `actor`: start, signals, log, end |
 //! | [`scene`] | a temporary directory with a tiny configuration, and the runs in it |
 //! | [`terminal`] | a program on a terminal of its own: keys in, the screen out |
+//! | [`account`] | the checker of `events.jsonl` |
 //! | [`authority`] | certificates |
 //! | [`net`] | a free port, a plain HTTP request, the health service |
 //!
@@ -14,12 +15,14 @@
 
 use std::time::{Duration, Instant};
 
+pub mod account;
 pub mod authority;
 pub mod net;
 pub mod process;
 pub mod scene;
 pub mod terminal;
 
+pub use account::Account;
 pub use authority::Authority;
 pub use process::{Outcome, Process, Program};
 pub use scene::Scene;

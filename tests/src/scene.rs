@@ -6,6 +6,7 @@ use std::path::PathBuf;
 use serde_json::Value;
 use tempfile::TempDir;
 
+use crate::Account;
 use crate::process::{Process, Program};
 use crate::terminal::Terminal;
 
@@ -133,6 +134,16 @@ impl Scene {
     #[track_caller]
     pub fn metrics(&self, run: &str) -> String {
         self.read(&format!("{run}/metrics.csv"))
+    }
+
+    /// `metrics.csv` of a run whose account is in order.
+    ///
+    /// # Panics
+    /// If it is not, or something is missing.
+    #[track_caller]
+    pub fn accounted(&self, run: &str) -> String {
+        Account::check(self, run);
+        self.metrics(run)
     }
 
     /// The largest difference in a run between the log-probabilities of its actors and those of its learner, of the same

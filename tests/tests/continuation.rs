@@ -71,7 +71,7 @@ fn continue_is_what_a_requeued_job_needs() {
         rows = scene.rows("run");
     }
     continued(&scene, &STEPS).expect(0);
-    assert_eq!(scene.metrics("run"), *UNDISTURBED);
+    assert_eq!(scene.accounted("run"), *UNDISTURBED);
 }
 
 /// Deaths one after the other, each at the next of the places around a row of metrics and a checkpoint: the n-th life ends
@@ -164,7 +164,7 @@ fn one_learner_a_directory() {
     learner.kill();
     // The lock goes with its holder.
     scene.resume("run", &["--actors", "1", "--listen", "127.0.0.1:0"]).expect(0);
-    assert_eq!(scene.metrics("run"), *TINY);
+    assert_eq!(scene.accounted("run"), *TINY);
 }
 
 fn ctrl_c_saves_and_resume_completes(signal: Signal, lag: &str, checkpoint_epochs: &str) {
@@ -186,7 +186,7 @@ fn ctrl_c_saves_and_resume_completes(signal: Signal, lag: &str, checkpoint_epoch
     let summary = scene.json("run/summary.json");
     assert_eq!(summary["stopped_by"], "steps", "{summary}");
     if lag == "0" {
-        assert_eq!(scene.metrics("run"), *UNDISTURBED);
+        assert_eq!(scene.accounted("run"), *UNDISTURBED);
     } else {
         assert_eq!(scene.metrics("run"), Scene::new().curve("undisturbed", &["--lag", lag, STEPS[0], STEPS[1]]));
     }
@@ -217,7 +217,7 @@ fn ctrl_c_before_the_first_epoch() {
     assert!(scene.checkpoints("run").is_empty());
     assert_eq!(scene.json("run/summary.json")["epochs"], 0);
     scene.resume("run", &["--actors", "1"]).expect(0);
-    assert_eq!(scene.metrics("run"), *TINY);
+    assert_eq!(scene.accounted("run"), *TINY);
 }
 
 #[test]
@@ -240,7 +240,7 @@ fn a_second_ctrl_c_ends_at_once() {
     }
     Life::expect_gone(&actors);
     scene.resume("run", &[]).expect(0);
-    assert_eq!(scene.metrics("run"), *UNDISTURBED);
+    assert_eq!(scene.accounted("run"), *UNDISTURBED);
 }
 
 #[test]
@@ -268,7 +268,7 @@ fn a_complete_run_stays_as_it_is() {
     let summary = scene.read("run/summary.json");
     let outcome = scene.resume("run", &[]).expect(0);
     assert!(outcome.stdout.contains("already complete"), "{}", outcome.stdout);
-    assert_eq!(scene.metrics("run"), *TINY);
+    assert_eq!(scene.accounted("run"), *TINY);
     assert_eq!(scene.read("run/summary.json"), summary);
 }
 
@@ -328,5 +328,5 @@ fn a_summary_from_before_does_not_make_a_run_complete() {
     scene.resume("run", &[]).expect(0);
     let summary = scene.json("run/summary.json");
     assert_eq!((&summary["stopped_by"], &summary["epochs"]), (&"steps".into(), &8.into()), "{summary}");
-    assert_eq!(scene.metrics("run"), *TINY);
+    assert_eq!(scene.accounted("run"), *TINY);
 }

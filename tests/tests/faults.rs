@@ -49,7 +49,7 @@ fn a_killed_local_actor_is_replaced(lag: &str, actors: &str) {
     assert!(log.contains("a local actor has died (signal: 9 (SIGKILL)"), "{log}");
     let lost: Vec<&str> = log.lines().filter(|line| line.contains("actor lost")).collect();
     assert!(!lost.is_empty() && lost.len() <= actors.parse().unwrap(), "one line for each: {lost:?}");
-    assert_eq!(scene.metrics("run"), undisturbed(lag));
+    assert_eq!(scene.accounted("run"), undisturbed(lag));
 }
 
 #[test]
@@ -77,7 +77,7 @@ fn a_killed_remote_actor_is_replaced(lag: &str) {
     {
         assert_eq!(log.matches(line).count(), times, "{line}\n{log}");
     }
-    assert_eq!(scene.metrics("run"), undisturbed(lag));
+    assert_eq!(scene.accounted("run"), undisturbed(lag));
 }
 
 #[test]
@@ -104,7 +104,7 @@ fn an_actor_returns_when_the_network_does() {
     for line in ["actor joined actor=\"wanderer\"", "actor lost", "actor returned actor=\"wanderer\""] {
         assert_eq!(log.matches(line).count(), 1, "{line}\n{log}");
     }
-    assert_eq!(scene.metrics("run"), undisturbed("0"));
+    assert_eq!(scene.accounted("run"), undisturbed("0"));
 }
 
 #[test]
@@ -118,7 +118,7 @@ fn a_remote_actor_waits_for_a_learner_that_was_killed() {
     let resumed = scene.resume("run", &["--listen", url.trim_start_matches("http://")]);
     actor.expect(0);
     resumed.expect(0);
-    assert_eq!(scene.metrics("run"), undisturbed("0"));
+    assert_eq!(scene.accounted("run"), undisturbed("0"));
 }
 
 /// Kills the learner of a run with these flags in its middle; its actors go too.
@@ -142,7 +142,7 @@ fn a_killed_learner_is_resumed(lag: &str) {
     scene.write("run/checkpoints/epoch-000029.tmp/manifest.json", "{\"format\": 1,");
     let outcome = scene.resume("run", &["--actors", "1"]).expect(0);
     assert!(!outcome.stderr.contains("checkpoint not used"), "{}", outcome.stderr);
-    assert_eq!(scene.metrics("run"), undisturbed(lag));
+    assert_eq!(scene.accounted("run"), undisturbed(lag));
 }
 
 #[test]
@@ -159,7 +159,7 @@ fn a_learner_killed_before_its_first_checkpoint_begins_anew(lag: &str) {
     let scene = a_run_whose_learner_was_killed(&["--lag", lag, "--checkpoint-epochs", "1000"]);
     assert!(scene.checkpoints("run").is_empty());
     scene.resume("run", &[]).expect(0);
-    assert_eq!(scene.metrics("run"), undisturbed(lag));
+    assert_eq!(scene.accounted("run"), undisturbed(lag));
 }
 
 #[test]
@@ -186,5 +186,5 @@ fn everything_fails_again_and_again() {
         scene.reached(&mut learner, "run", MIDDLE + 3 * round - 2);
     }
     learner.expect(0);
-    assert_eq!(scene.metrics("run"), undisturbed("1"));
+    assert_eq!(scene.accounted("run"), undisturbed("1"));
 }

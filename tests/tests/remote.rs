@@ -49,7 +49,7 @@ fn actors_come_work_and_leave_by_themselves() {
     for log in logs {
         assert_eq!(log.matches("run complete: the run is complete").count(), 1, "{log}");
     }
-    assert_eq!(scene.metrics("run"), Scene::new().curve("local", &["--steps", "16384"]));
+    assert_eq!(scene.accounted("run"), Scene::new().curve("local", &["--steps", "16384"]));
 }
 
 #[test]
@@ -75,7 +75,7 @@ fn an_actor_stays_where_the_learner_was_interrupted() {
     let resumed = scene.resume("run", &["--listen", url.trim_start_matches("http://")]);
     actor.expect(0);
     resumed.expect(0);
-    assert_eq!(scene.metrics("run"), Scene::new().curve("undisturbed", &["--steps", "16384"]));
+    assert_eq!(scene.accounted("run"), Scene::new().curve("undisturbed", &["--steps", "16384"]));
 }
 
 #[test]
@@ -108,7 +108,7 @@ fn who_is_refused_is_told_why_and_the_run_goes_on() {
     }
     scene.actor(&url, &[]).expect(0);
     learner.expect(0);
-    assert_eq!(scene.metrics("run"), Scene::new().curve("local", &[]));
+    assert_eq!(scene.accounted("run"), Scene::new().curve("local", &[]));
 }
 
 /// The only error of an actor that fails.

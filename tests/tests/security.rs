@@ -3,6 +3,7 @@
 use std::io::Read as _;
 use std::net::TcpStream;
 use std::os::unix::fs::PermissionsExt as _;
+use std::path::Path;
 use std::process::Command;
 
 use popgym_tests::{Authority, Process, Scene, net, until};
@@ -63,7 +64,7 @@ fn those_who_belong_here_get_the_same_curve() {
     scene.actor(&url, &ACTOR).expect(0);
     learner.expect(0);
     let undisturbed = Scene::new().curve("plain", &[]);
-    assert_eq!(scene.metrics("run"), undisturbed);
+    assert_eq!(scene.accounted("run"), undisturbed);
     // Local actors, which have no certificate, and the token.
     scene.train("local", &with(&LEARNER, "--actors", "1")).expect(0);
     assert_eq!(scene.metrics("local"), undisturbed);
@@ -122,7 +123,7 @@ fn strangers_are_refused_counted_and_told_of_once() {
     for text in logs {
         assert!(!text.contains("horse") && !text.contains("PRIVATE KEY"), "{text}");
     }
-    assert_eq!(scene.metrics("run"), Scene::new().curve("plain", &[]));
+    assert_eq!(scene.accounted("run"), Scene::new().curve("plain", &[]));
 }
 
 #[test]
@@ -214,7 +215,8 @@ fn the_clusters_script_makes_files_that_work() {
         assert_eq!(mode & 0o077, 0, "{secret} is for its owner alone");
     }
     let rename = |flags: &[&str]| -> Vec<String> {
-        let is_file = |flag: &str| flag == "token" || flag.ends_with(".pem") || flag.ends_with(".key");
+        let is_file =
+            |flag: &str| flag == "token" || Path::new(flag).extension().is_some_and(|end| end == "pem" || end == "key");
         flags.iter().map(|flag| if is_file(flag) { format!("certs/{flag}") } else { (*flag).to_owned() }).collect()
     };
     let (learner, actor) = (rename(&LEARNER), rename(&ACTOR));

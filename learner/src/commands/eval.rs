@@ -70,7 +70,7 @@ pub fn eval(args: &EvalArgs, extensions: &Extensions) -> Outcome {
         .with_context(|| format!("{} holds no checkpoint yet", args.dir.display()))?;
     session.policy()?.load(&checkpoint.weights).map_err(anyhow::Error::from)?;
     let purpose = Purpose::Evaluation { greedy: args.greedy };
-    session.serve(&format!("evaluation-{}", std::process::id()), purpose)?;
+    session.serve(&format!("evaluation-{}", std::process::id()), purpose, None)?;
     let service = session.service()?;
     let epoch = checkpoint.progress.epoch;
     service.open(0, epoch, Bytes::clone(&checkpoint.weights), Target::Episodes(args.episodes))?;

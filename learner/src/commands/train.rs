@@ -118,7 +118,7 @@ fn carry_out(
     files::write(&RunDir::config_path(dir.path()), &config.to_toml()?)?;
     let (policy, behaviour) = (session.first_policy()?, session.policy()?);
     let observers = observers(dir, config, checkpoint.as_ref(), extensions.observers)?;
-    session.serve(dir.run(), Purpose::Training)?;
+    session.serve(dir.run(), Purpose::Training, Some(&dir.path().join("events.jsonl")))?;
     let trainer = Trainer {
         config,
         action: session.env().action.clone(),

@@ -14,6 +14,7 @@ use tokio::sync::{mpsc, oneshot};
 use tonic::Status;
 use tracing::info;
 
+use super::account::{Account, Entry, ranges};
 use super::planner::{LengthEstimate, Progress, Seat, Target, assign, further_leases};
 use super::session::Order;
 use super::{Collected, metrics};
@@ -78,11 +79,17 @@ pub(super) struct Coordinator {
     length: LengthEstimate,
     results: std::sync::mpsc::Sender<Collected>,
     shared: Arc<Shared>,
+    account: Account,
     finishing: Option<(String, oneshot::Sender<()>)>,
 }
 
 impl Coordinator {
-    pub(super) fn new(max_steps: u32, results: std::sync::mpsc::Sender<Collected>, shared: Arc<Shared>) -> Self {
+    pub(super) fn new(
+        max_steps: u32,
+        results: std::sync::mpsc::Sender<Collected>,
+        shared: Arc<Shared>,
+        account: Account,
+    ) -> Self {
         Self {
             sessions: BTreeMap::new(),
             known: HashMap::new(),
@@ -90,6 +97,7 @@ impl Coordinator {
             length: LengthEstimate::unknown(max_steps),
             results,
             shared,
+            account,
             finishing: None,
         }
     }
@@ -105,6 +113,7 @@ impl Coordinator {
             }
             self.close_if_complete();
             self.lease();
+            self.account.flush();
             metrics::queues(queued, self.epoch.as_ref().map_or(0, |epoch| epoch.holders.len()));
             if self.sessions.is_empty()
                 && let Some((_, gone)) = self.finishing.take()
@@ -131,6 +140,7 @@ impl Coordinator {
             Event::Left { session, reason } => self.leave(session, &reason),
             Event::Open { epoch, weights, target } => self.open(epoch, weights, target),
             Event::Finish { reason, gone } => {
+                self.account.write(Entry::Finished { reason: &reason });
                 self.epoch = None;
                 self.finishing = Some((reason.clone(), gone));
                 self.order_all(|_| Some(Order::Stop { reason: reason.clone() }));
@@ -159,6 +169,7 @@ impl Coordinator {
         let what = if known.is_some() { "actor returned" } else { "actor joined" };
         info!(actor, slots, actors = self.sessions.len() + 1, "{what}");
         metrics::joined(known.is_some());
+        self.account.write(Entry::Joined { actor: &actor, returned: known.is_some() });
         self.sessions.insert(session, Session { actor, slots, orders, version: None, held: BTreeSet::new() });
         self.count_actors();
         Ok(())
@@ -203,10 +214,11 @@ impl Coordinator {
     fn leave(&mut self, id: u64, reason: &str) {
         let Some(session) = self.sessions.remove(&id) else { return };
         self.count_actors();
+        let leases = session.held.len();
+        self.account.write(Entry::Left { actor: &session.actor, leases, reason });
         if self.finishing.is_some() {
             return;
         }
-        let leases = session.held.len();
         if let Some(epoch) = &mut self.epoch {
             for index in &session.held {
                 epoch.holders.remove(index);
@@ -228,6 +240,7 @@ impl Coordinator {
             session.held.clear();
         }
         metrics::opened(epoch, weights.version);
+        self.account.write(Entry::Opened { epoch, version: weights.version, target });
         self.epoch = Some(Epoch {
             number: epoch,
             weights,
@@ -248,23 +261,38 @@ impl Coordinator {
     }
 
     /// Keeps the episodes that are leased to this session; counts and drops the others.
-    fn receive(&mut self, id: u64, batch: EpisodeBatch) {
+    fn receive(&mut self, id: u64, EpisodeBatch { epoch: number, version, episodes }: EpisodeBatch) {
         let Some(session) = self.sessions.get_mut(&id) else { return };
-        let Some(epoch) = self.epoch.as_mut().filter(|epoch| epoch.number == batch.epoch) else {
-            return metrics::refused("late", batch.episodes.len());
+        let actor = session.actor.as_str();
+        let refuse = |account: &mut Account, reason, episodes: Vec<u64>| {
+            metrics::refused(reason, episodes.len());
+            account.write(Entry::Refused { epoch: number, version, actor, reason, episodes: ranges(episodes) });
         };
-        if batch.version != epoch.weights.version {
-            return metrics::refused("version", batch.episodes.len());
+        let numbers = |episodes: &[Episode]| episodes.iter().map(|episode| episode.index).collect();
+        let Some(epoch) = self.epoch.as_mut().filter(|epoch| epoch.number == number) else {
+            return refuse(&mut self.account, "late", numbers(&episodes));
+        };
+        if version != epoch.weights.version {
+            return refuse(&mut self.account, "version", numbers(&episodes));
         }
-        for episode in batch.episodes {
-            // A duplicate is not held any more, so it is refused here too.
-            if !session.held.remove(&episode.index) {
-                metrics::refused("unleased", 1);
-                continue;
+        // A duplicate is not held any more, so it is refused here too.
+        let (mut accepted, mut unleased) = (Vec::new(), Vec::new());
+        for episode in episodes {
+            if session.held.remove(&episode.index) {
+                metrics::accepted();
+                accepted.push(episode.index);
+                self.length.see(episode.steps);
+                epoch.accept(episode);
+            } else {
+                unleased.push(episode.index);
             }
-            metrics::accepted();
-            self.length.see(episode.steps);
-            epoch.accept(episode);
+        }
+        if !accepted.is_empty() {
+            let episodes = ranges(accepted);
+            self.account.write(Entry::Accepted { epoch: number, version, actor, episodes });
+        }
+        if !unleased.is_empty() {
+            refuse(&mut self.account, "unleased", unleased);
         }
     }
 
@@ -278,6 +306,15 @@ impl Coordinator {
             session.held.clear();
         }
         let collected = epoch.into_collected();
+        self.account.write(Entry::Closed {
+            epoch: number,
+            version: collected.version,
+            episodes: collected.episodes.len() as u64,
+            steps: collected.steps,
+            surplus_episodes: collected.surplus_episodes,
+        });
+        // Before the trainer makes something of it.
+        self.account.flush();
         // The trainer may be ending.
         let _ = self.results.send(collected);
     }
@@ -306,6 +343,8 @@ impl Coordinator {
         for (id, episodes) in leases {
             if let Some(session) = self.sessions.get_mut(&id) {
                 session.held.extend(&episodes);
+                let episodes = ranges(episodes.iter().copied());
+                self.account.write(Entry::Leased { epoch: number, actor: &session.actor, episodes });
             }
             self.order(id, Order::Lease(Leases { epoch: number, episodes }));
         }

@@ -10,6 +10,10 @@ pub(super) fn describe() {
         "popgym_learner_connections_refused_total",
         "Connections refused, by reason: full, tls, token, deadline (no hello in time)"
     );
+    describe_counter!(
+        "popgym_learner_account_failures_total",
+        "Times that events.jsonl could not be written, and ended"
+    );
     describe_gauge!("popgym_learner_open_epoch", "Epoch that is being sampled");
     describe_gauge!("popgym_learner_sampling_version", "Version of the weights that sample it");
     describe_gauge!("popgym_learner_lag_epochs", "Open epoch minus the version that samples it");
@@ -38,6 +42,10 @@ pub(super) fn connections(count: usize) {
 
 pub(super) fn connection_refused(reason: &'static str) {
     counter!("popgym_learner_connections_refused_total", "reason" => reason).increment(1);
+}
+
+pub(super) fn account_failed() {
+    counter!("popgym_learner_account_failures_total").increment(1);
 }
 
 pub(super) fn opened(epoch: u64, version: u64) {

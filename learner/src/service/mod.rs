@@ -3,6 +3,7 @@
 //! | module | what it holds |
 //! |---|---|
 //! | `connections` | who may connect, how many, and how long without a word |
+//! | `account` | what happened, in `events.jsonl` |
 //! | `tls` | the learner's certificate, and its actors' |
 //! | `session` | one actor: handshake, checks, deadlines |
 //! | `coordinator` | the single owner of sessions, leases and episodes |
@@ -14,7 +15,7 @@
 
 use std::cell::Cell;
 use std::net::{SocketAddr, TcpListener};
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::pin::Pin;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -30,6 +31,7 @@ use tokio_stream::wrappers::ReceiverStream;
 use tonic::service::interceptor::InterceptedService;
 use tonic::{Request, Response, Status, Streaming};
 
+mod account;
 mod connections;
 mod coordinator;
 mod metrics;
@@ -41,6 +43,7 @@ mod tls;
 pub use planner::Target;
 pub use tls::TlsFiles;
 
+use account::{Account, Entry};
 use connections::{Gate, Peer};
 use coordinator::{Coordinator, Event, Shared};
 use reloaded::Reloaded;
@@ -94,7 +97,7 @@ pub struct Service {
 
 impl Service {
     /// Serves actors at `entrances`, of which there is at least one; all of them show the token in `token_file`, if that is
-    /// given. `episodes` is what their episodes look like, `fingerprint` what they must build.
+    /// given. `account` is the file in which what happens is written down. `episodes` is what their episodes look like, `fingerprint` what they must build.
     ///
     /// # Errors
     /// Specifications beyond the wire's limits, certificates or a token that cannot be read, or a system that refuses threads
@@ -102,6 +105,7 @@ impl Service {
     pub fn start(
         entrances: Vec<Entrance>,
         token_file: Option<PathBuf>,
+        account: Option<&Path>,
         spec: RunSpec,
         episodes: EpisodeSpec,
         fingerprint: Fingerprint,
@@ -119,7 +123,10 @@ impl Service {
         let (events, inbox) = mpsc::channel(limits::COORDINATOR_QUEUE);
         let (results_in, results) = std::sync::mpsc::channel();
         let shared = Arc::new(Shared::default());
-        runtime.spawn(Coordinator::new(spec.max_episode_steps, results_in, shared.clone()).run(inbox));
+        let mut account = account.map(Account::open).transpose()?.unwrap_or_default();
+        account.write(Entry::Started { run: &spec.run, build: env!("CARGO_PKG_VERSION"), lag: spec.lag });
+        let coordinator = Coordinator::new(spec.max_episode_steps, results_in, shared.clone(), account);
+        runtime.spawn(coordinator.run(inbox));
         let endpoint = Endpoint {
             terms: Arc::new(Terms { spec, episodes, fingerprint }),
             events: events.clone(),

@@ -33,7 +33,7 @@ fn service() -> Service {
     let episodes =
         EpisodeSpec { observation: Space::Discrete(256), action: Space::MultiDiscrete(vec![4]), max_steps: MAX_STEPS };
     let entrance = Entrance { listener: TcpListener::bind("127.0.0.1:0").unwrap(), tls: None };
-    Service::start(vec![entrance], None, spec, episodes, FINGERPRINT).unwrap()
+    Service::start(vec![entrance], None, None, spec, episodes, FINGERPRINT).unwrap()
 }
 
 /// Two epochs whose episodes all have the same length: 1 step, then 40.
