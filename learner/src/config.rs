@@ -66,7 +66,7 @@ pub struct Config {
 }
 
 /// How a run is carried out: the configuration's `[service]` table.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct ServiceConfig {
     /// Local actor processes; 0: wait for remote ones.
@@ -337,18 +337,7 @@ fn preset_table(name: &str, env: &EnvSpec) -> anyhow::Result<Table> {
         rows: 128,
         checkpoint_epochs: 10,
         keep_checkpoints: 3,
-        service: ServiceConfig {
-            actors: cores,
-            slots: 128,
-            actor_command: Vec::new(),
-            listen: String::new(),
-            metrics_listen: String::new(),
-            token_file: String::new(),
-            tls_certificate: String::new(),
-            tls_key: String::new(),
-            tls_client_ca: String::new(),
-            insecure: false,
-        },
+        service: ServiceConfig { actors: cores, slots: 128, ..ServiceConfig::default() },
         memory: Table::from_iter([("name".to_owned(), Value::String("gru".to_owned()))]),
         policy: PolicyOptions { log_std_min: log_std.0, log_std_max: log_std.1 },
         ppo,

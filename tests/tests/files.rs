@@ -171,8 +171,7 @@ fn pictures_events_and_nothing_else() {
         .unwrap()
         .map(|entry| entry.unwrap().file_name().into_string().unwrap())
         .collect();
-    let expected =
-        "checkpoints config.toml curve.png curve.svg lock metrics.csv run.json summary.json tensorboard timing.csv";
+    let expected = "checkpoints config.toml curve.png curve.svg events.jsonl lock metrics.csv run.json summary.json tensorboard timing.csv";
     assert_eq!(names, expected.split(' ').map(str::to_owned).collect());
 }
 

@@ -11,7 +11,7 @@ use serde::Serialize;
 use super::{Failure, Outcome, choose_checkpoint, say};
 use crate::Extensions;
 use crate::args::EvalArgs;
-use crate::config::{Config, Purpose};
+use crate::config::{Config, Purpose, ServiceConfig};
 use crate::interrupt::{EXIT_INTERRUPTED, Interrupt};
 use crate::run_dir::RunDir;
 use crate::service::Target;
@@ -104,9 +104,14 @@ fn configure(args: &EvalArgs, extensions: &Extensions) -> anyhow::Result<(Config
     }
     config.seed = args.seed;
     "cpu".clone_into(&mut config.device);
-    config.service.actors = args.actors;
-    "127.0.0.1:0".clone_into(&mut config.service.listen);
-    config.service.metrics_listen.clear();
+    // Its actors are local, whatever the run's were.
+    config.service = ServiceConfig {
+        actors: args.actors,
+        listen: "127.0.0.1:0".to_owned(),
+        slots: config.service.slots,
+        actor_command: config.service.actor_command,
+        ..ServiceConfig::default()
+    };
     config.validate()?;
     Ok((config, trained_on))
 }
