@@ -29,6 +29,9 @@ fn scan_all(memory: &dyn Memory, sequences: &[Tensor]) -> (Vec<Tensor>, Vec<Stat
 /// Of the largest output, or of 1 if that is more.
 const ROUNDING: f64 = 1e-5;
 
+/// The largest difference that a jump of the DNC may make; seen were up to 3e-4.
+const JUMP: f64 = 1e-3;
+
 /// The largest difference, of the largest |b| or of 1.
 fn difference(a: &Tensor, b: &Tensor) -> f64 {
     assert_eq!(a.size(), b.size());
@@ -65,13 +68,15 @@ fn begins_at_a_crossing(memory: &dyn Memory, inputs: &Tensor, output: &Tensor, s
     lower.gt(USED).logical_and(&gaps.lt(CLOSE)).any().int64_value(&[]) == 1
 }
 
-/// Outputs, and what follows from the states, are those of the steps.
+/// Outputs, and what follows from the states, are those of the steps. Where a memory may jump, at most one of the sequences does.
 fn assert_forms_agree(name: &str, memory: &dyn Memory, lengths: &[i64]) {
     let sequences = sequences(lengths, WIDTH);
     let (outputs, states) = scan_all(memory, &sequences);
     let initial = || memory.initial_state(1, Device::Cpu);
     let step = |x: &Tensor, state: &State| memory.step(x, state);
+    let mut may_jump = name == "dnc";
     for ((sequence, output), state) in sequences.iter().zip(outputs).zip(states) {
+        let mut jumped = false;
         assert_eq!(output.size(), [sequence.size()[0], memory.output_width()], "{name}");
         let more = random(6, WIDTH);
         let inputs = Tensor::cat(&[sequence, &more], 0);
@@ -81,13 +86,13 @@ fn assert_forms_agree(name: &str, memory: &dyn Memory, lengths: &[i64]) {
         {
             let output = Tensor::cat(&[output, by_steps(&more, state, step).0], 0);
             let difference = difference(&output, &stepped);
-            let explained = || name == "dnc" && begins_at_a_crossing(memory, &inputs, &output, &stepped);
             let steps = sequence.size()[0];
-            assert!(
-                difference <= ROUNDING || explained(),
-                "{name}, {steps} of {lengths:?}: {form} differs from steps by {difference:e}"
-            );
+            if difference > ROUNDING {
+                jumped = may_jump && difference <= JUMP && begins_at_a_crossing(memory, &inputs, &output, &stepped);
+                assert!(jumped, "{name}, {steps} of {lengths:?}: {form} differs from steps by {difference:e}");
+            }
         }
+        may_jump &= !jumped;
     }
 }
 

@@ -3,13 +3,13 @@
 
 use std::collections::HashMap;
 use std::io;
-use std::net::{IpAddr, Ipv4Addr, TcpListener};
+use std::net::{IpAddr, Ipv4Addr};
 use std::pin::Pin;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::task::{Context, Poll};
 use std::time::Duration;
 
-use popgym_proto::{limits, transport};
+use popgym_proto::limits;
 use tokio::io::{AsyncRead, AsyncWrite, ReadBuf};
 use tokio::net::TcpStream;
 use tokio::sync::mpsc;
@@ -17,7 +17,7 @@ use tokio::time::{Instant, Sleep, sleep_until, timeout};
 use tokio_rustls::TlsAcceptor;
 use tokio_rustls::rustls::ServerConfig;
 use tokio_stream::StreamExt as _;
-use tonic::transport::server::Connected;
+use tonic::transport::server::{Connected, TcpIncoming};
 use tracing::warn;
 
 use super::metrics;
@@ -196,13 +196,11 @@ impl AsyncWrite for Connection {
 
 /// Accepts connections until nobody takes them any more.
 pub(super) async fn accept(
-    listener: TcpListener,
+    mut incoming: TcpIncoming,
     tls: Option<Reloaded<ServerConfig>>,
     gate: Arc<Gate>,
     accepted: mpsc::Sender<io::Result<Connection>>,
-) -> io::Result<()> {
-    listener.set_nonblocking(true)?;
-    let mut incoming = transport::incoming(tokio::net::TcpListener::from_std(listener)?);
+) {
     while let Some(stream) = tokio::select! {
         stream = incoming.next() => stream,
         () = accepted.closed() => None,
@@ -231,7 +229,6 @@ pub(super) async fn accept(
             }
         });
     }
-    Ok(())
 }
 
 async fn greet(stream: TcpStream, acceptor: Option<TlsAcceptor>, peer: &Peer) -> Option<Box<dyn Duplex>> {

@@ -137,7 +137,9 @@ impl Service {
         let gate = Arc::new(Gate::default());
         for Entrance { listener, tls } in entrances {
             let tls = tls.map(TlsFiles::load).transpose()?;
-            runtime.spawn(connections::accept(listener, tls, gate.clone(), accepted.clone()));
+            listener.set_nonblocking(true)?;
+            let listener = runtime.block_on(async { tokio::net::TcpListener::from_std(listener) })?;
+            runtime.spawn(connections::accept(transport::incoming(listener), tls, gate.clone(), accepted.clone()));
         }
         runtime.spawn(async move {
             let (health, health_service) = tonic_health::server::health_reporter();
