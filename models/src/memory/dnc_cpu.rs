@@ -1,8 +1,11 @@
 //! The DNC on the CPU: a loop over time with a backward of its own.
 //!
-//! A time step needs two matrix products forward, for the controller's gates and for the interface, and two backward; the
-//! products of the input, the output and all weights' gradients are one for all rows. They are libtorch's; the rest is
-//! plain Rust: the LSTM's pointwise part here, the memory cells in `dnc_forward.rs` and `dnc_backward.rs`.
+//! A time step needs three matrix products forward, two for the controller's gates and one for the interface, and two
+//! backward; the products of the input, the output and all weights' gradients are one for all rows. They are libtorch's; the
+//! rest is plain Rust: the LSTM's pointwise part here, the memory cells in `dnc_forward.rs` and `dnc_backward.rs`.
+//!
+//! The output jumps where two usages cross (`dnc.rs`), so that agreement but for rounding would not do: `act` and `scan`
+//! compute a row with the same bits, however many others there are ([`add_product`]).
 //!
 //! ```text
 //! a = W x + U [h ; r] + b,   i, f, o = sigmoid(a_i, a_f, a_o),   g = tanh(a_g)
@@ -38,14 +41,17 @@ pub(super) fn act(dnc: &Dnc, input: &Tensor, state: &State) -> (Tensor, State) {
     tch::no_grad(|| {
         let (s, state) = (dnc.sizes(), contiguous(state));
         let rows = input.size()[0];
-        let mut a = dnc.bias().addmm(&Tensor::cat(&[input, &state[8]], 1), &dnc.weight_input.tr());
-        let _ = a.addmm_(&state[0], &dnc.weight_state.tr());
+        let mut a = dnc.bias().repeat([rows, 1]);
+        add_product(&mut a, input, &dnc.of_input().tr());
+        add_product(&mut a, &state[0], &dnc.weight_state.tr());
+        add_product(&mut a, &state[8], &dnc.of_reads().tr());
         let mut z = empty(rows, dnc.hidden as usize + s.reads());
         let mut next: Vec<Tensor> = state[1..8].iter().map(Tensor::empty_like).collect();
         let hidden = dnc.hidden as usize;
         lstm(floats_mut(&mut a), floats(&state[1]), floats_mut(&mut next[0]), floats_mut(&mut z), hidden);
         let h = z.narrow(1, 0, dnc.hidden);
-        let mut xi = dnc.bias_interface.addmm(&h, &dnc.weight_interface.tr());
+        let mut xi = dnc.bias_interface.repeat([rows, 1]);
+        add_product(&mut xi, &h, &dnc.weight_interface.tr());
         let mut after = next[1..].iter_mut();
         let step = dnc_forward::Rows {
             before: fields(&state),
@@ -60,6 +66,19 @@ pub(super) fn act(dnc: &Dnc, input: &Tensor, state: &State) -> (Tensor, State) {
         next.push(z.narrow(1, dnc.hidden, s.reads() as i64).contiguous());
         (output, State(next))
     })
+}
+
+/// `out += x weight`. The bits of a row do not depend on the number of rows, as far as libtorch sees to it for 16 and more;
+/// fewer, for which it has other ways, are filled up.
+fn add_product(out: &mut Tensor, x: &Tensor, weight: &Tensor) {
+    const ROWS: i64 = 16;
+    let rows = x.size()[0];
+    if rows >= ROWS {
+        let _ = out.addmm_(x, weight);
+    } else {
+        let [mut filled, x] = [&*out, x].map(|x| x.constant_pad_nd([0, 0, 0, ROWS - rows]));
+        out.copy_(&filled.addmm_(&x, weight).narrow(0, 0, rows));
+    }
 }
 
 /// Whole sequences: packed `input [rows, inputs]`, `initial` in packed order. If `input` wants gradients, what the backward
@@ -91,10 +110,14 @@ impl Dnc {
         self.weight_input.size()[1] - self.heads * self.width
     }
 
-    /// The gates' weights `[4 hidden, hidden + reads]` for what the step before left.
-    fn recurrent(&self) -> Tensor {
-        let reads = self.weight_input.narrow(1, self.inputs(), self.heads * self.width);
-        Tensor::cat(&[&self.weight_state, &reads], 1)
+    /// The gates' weights for the input, `[4 hidden, inputs]`.
+    fn of_input(&self) -> Tensor {
+        self.weight_input.narrow(1, 0, self.inputs())
+    }
+
+    /// The gates' weights for the read vectors, `[4 hidden, reads]`.
+    fn of_reads(&self) -> Tensor {
+        self.weight_input.narrow(1, self.inputs(), self.heads * self.width)
     }
 }
 
@@ -118,14 +141,15 @@ struct Tape {
 impl Tape {
     fn new(dnc: &Dnc, input: &Tensor, packing: &Packing, initial: &State) -> Self {
         let (s, rows) = (dnc.sizes(), packing.rows());
-        let weight = dnc.weight_input.narrow(1, 0, dnc.inputs());
         let initial = &initial.0;
+        let mut a = dnc.bias().repeat([rows, 1]);
+        add_product(&mut a, input, &dnc.of_input().tr());
         Self {
             steps: Step::all(packing),
             input: input.detach(),
             z: Trajectory::new(packing, &Tensor::cat(&[&initial[0], &initial[8]], 1)),
-            a: dnc.bias().addmm(input, &weight.tr()),
-            xi: empty(rows, s.interface()),
+            a,
+            xi: dnc.bias_interface.repeat([rows, 1]),
             c: Trajectory::new(packing, &initial[1]),
             fields: std::array::from_fn(|field| Trajectory::new(packing, &initial[2 + field].flatten(1, -1))),
             trace: vec![0.0; rows as usize * s.trace()],
@@ -134,16 +158,19 @@ impl Tape {
 
     fn forward(&mut self, dnc: &Dnc) {
         let (s, hidden) = (dnc.sizes(), dnc.hidden as usize);
-        let (recurrent, interface) = (dnc.recurrent().tr(), dnc.weight_interface.tr());
+        let (of_h, of_reads, interface) = (dnc.weight_state.tr(), dnc.of_reads().tr(), dnc.weight_interface.tr());
+        let reads = dnc.heads * dnc.width;
         let mut scratch = dnc_forward::Scratch::new(s);
         for step in &self.steps {
             let now = &step.now;
             let [mut a, mut xi] = [&self.a, &self.xi].map(|x| narrow(x, now));
             let mut z = self.z.after_step(step);
-            let _ = a.addmm_(&self.z.before(step), &recurrent);
+            let z_before = self.z.before(step);
+            add_product(&mut a, &z_before.narrow(1, 0, dnc.hidden), &of_h);
+            add_product(&mut a, &z_before.narrow(1, dnc.hidden, reads), &of_reads);
             let (c_before, c) = self.c.slices(step);
             lstm(floats_mut(&mut a), c_before, c, floats_mut(&mut z), hidden);
-            let _ = dnc.bias_interface.addmm_out(&xi, &z.narrow(1, 0, dnc.hidden), &interface);
+            add_product(&mut xi, &z.narrow(1, 0, dnc.hidden), &interface);
 
             let pairs = self.fields.each_mut().map(|field| field.slices(step));
             let rows = dnc_forward::Rows {
@@ -172,18 +199,18 @@ impl Tape {
     fn backward(mut self, dnc: &Dnc, grad_output: &Tensor) -> Tensor {
         let (gradients, grad_input) = tch::no_grad(|| {
             let grad_output = grad_output.contiguous();
-            let recurrent = dnc.recurrent();
+            let recurrent = Tensor::cat(&[&dnc.weight_state, &dnc.of_reads()], 1);
             self.backward_steps(dnc, &grad_output.mm(&dnc.weight_output), &recurrent);
             let sum = |x: &Tensor| x.sum_dim_intlist(0, false, Kind::Float);
             let (da, dxi) = (&self.a, &self.xi);
             let d_recurrent = da.tr().mm(&self.z.all_before(&self.steps));
-            let (inputs, reads) = (dnc.inputs(), dnc.heads * dnc.width);
+            let reads = dnc.heads * dnc.width;
             let d_input = Tensor::cat(&[da.tr().mm(&self.input), d_recurrent.narrow(1, dnc.hidden, reads)], 1);
             let d_state = d_recurrent.narrow(1, 0, dnc.hidden).contiguous();
             let d_interface = dxi.tr().mm(&self.z.after().narrow(1, 0, dnc.hidden));
             let d_output = grad_output.tr().mm(&self.z.after());
             let biases = [sum(da), sum(da), sum(dxi), sum(&grad_output)];
-            let grad_input = da.mm(&dnc.weight_input.narrow(1, 0, inputs));
+            let grad_input = da.mm(&dnc.of_input());
             ([d_input, d_state, d_interface, d_output].into_iter().chain(biases).collect::<Vec<_>>(), grad_input)
         });
         let weights = [&dnc.weight_input, &dnc.weight_state, &dnc.weight_interface, &dnc.weight_output];

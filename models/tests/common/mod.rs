@@ -142,3 +142,17 @@ pub fn assert_gradient_close(a: &Tensor, b: &Tensor, relative: f64, what: &str) 
     assert!(scale > 0.0, "{what}: the gradient is zero");
     assert!(difference <= relative * scale, "{what}: gradients differ by {difference:e} at a scale of {scale}");
 }
+
+/// Whether this machine's libtorch gives a row of a product `[rows, from] x [from, to]` the same bits however many others
+/// there are, from 16 on; for these widths.
+pub fn libtorch_keeps_rows_apart(widths: &[(i64, i64)]) -> bool {
+    widths.iter().all(|&(from, to)| {
+        let (x, weight) = (random(256, from), random(to, from));
+        let whole = x.mm(&weight.tr());
+        [16, 17, 20, 31, 64, 100].iter().all(|&rows| {
+            [0, 256 - rows]
+                .iter()
+                .all(|&start| whole.narrow(0, start, rows).equal(&x.narrow(0, start, rows).mm(&weight.tr())))
+        })
+    })
+}
