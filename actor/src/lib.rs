@@ -43,7 +43,7 @@ use session::{End, Identity};
 use worker::Worker;
 
 /// Waits before the first attempt to reconnect and, at most, before any.
-const BACKOFF: (Duration, Duration) = (Duration::from_millis(200), Duration::from_secs(10));
+const BACKOFF: (Duration, Duration) = (Duration::from_millis(200), Duration::from_secs(3));
 
 /// Runs an actor until its run is complete, with these environments and memories. `args` as from
 /// [`std::env::args_os`]; a user's own `main` adds to the registries and calls this.

@@ -2,7 +2,7 @@
 
 use std::ffi::OsString;
 use std::io;
-use std::os::unix::process::CommandExt as _;
+use std::os::unix::process::{CommandExt as _, ExitStatusExt as _};
 use std::path::PathBuf;
 use std::process::{Child, Command, ExitStatus, Stdio};
 use std::sync::Arc;
@@ -11,6 +11,7 @@ use std::sync::mpsc::{Receiver, RecvTimeoutError, Sender, channel};
 use std::time::{Duration, Instant};
 
 use anyhow::Context as _;
+use signal_hook::consts::{SIGHUP, SIGINT, SIGKILL, SIGTERM};
 use tracing::warn;
 
 /// How often the processes are looked at.
@@ -26,6 +27,9 @@ const STOP_DEADLINE: Duration = Duration::from_secs(5);
 
 /// Set when a local actor has failed this often in a row, each time soon after its start: it will never work.
 const HOPELESS_FAILURES: u32 = 4;
+
+/// Signals by which somebody else ends an actor; by any other it has failed.
+const OTHERS: [i32; 4] = [SIGHUP, SIGINT, SIGKILL, SIGTERM];
 
 /// Whether local actors fail again and again.
 #[derive(Clone, Debug, Default)]
@@ -185,10 +189,14 @@ impl Actor {
                     // Told by the learner that the run is complete: the end is near.
                     self.died(LONGEST_WAIT);
                 } else {
-                    let (wait, failures) =
-                        if self.since.elapsed() > LONGEST_WAIT { (FIRST_WAIT, 0) } else { (self.wait, self.failures) };
-                    // A signal is somebody's doing, not the actor's own failure.
-                    self.failures = failures + u32::from(status.is_some_and(|status| status.code().is_some()));
+                    let killed =
+                        status.and_then(|status| status.signal()).is_some_and(|signal| OTHERS.contains(&signal));
+                    let (wait, failures) = match self.since.elapsed() > LONGEST_WAIT {
+                        true => (FIRST_WAIT, 0),
+                        false if killed => (FIRST_WAIT, self.failures),
+                        false => (self.wait, self.failures),
+                    };
+                    self.failures = failures + u32::from(!killed);
                     warn!("a local actor has died ({}); another is started in {wait:?}", describe(status));
                     self.died(wait);
                 }
