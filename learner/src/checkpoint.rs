@@ -86,7 +86,22 @@ impl Checkpoint {
         let path = path(dir, self.progress.epoch);
         let temporary = path.with_extension(TEMPORARY_SUFFIX.trim_start_matches('.'));
         remove_dir_if_there(&temporary)?;
-        fs::create_dir_all(&temporary).with_context(|| format!("cannot create {}", temporary.display()))?;
+        let written = self.write(&temporary, about).and_then(|()| {
+            remove_dir_if_there(&path)?;
+            fs::rename(&temporary, &path).with_context(|| format!("cannot rename {}", temporary.display()))
+        });
+        if written.is_err() {
+            // A full disk needs the room.
+            let _ = fs::remove_dir_all(&temporary);
+        }
+        written?;
+        fail_point::reached("a checkpoint whose name is not yet synced");
+        files::sync_dir(dir);
+        Ok(path)
+    }
+
+    fn write(&self, temporary: &Path, about: &Value) -> anyhow::Result<()> {
+        fs::create_dir_all(temporary).with_context(|| format!("cannot create {}", temporary.display()))?;
         let mut files = BTreeMap::new();
         for (name, bytes) in self.files() {
             fail_point::reached("a checkpoint without all its files");
@@ -102,13 +117,9 @@ impl Checkpoint {
             files,
         };
         write_synced(&temporary.join(MANIFEST), &serde_json::to_vec_pretty(&manifest)?)?;
-        files::sync_dir(&temporary);
+        files::sync_dir(temporary);
         fail_point::reached("a checkpoint under its temporary name");
-        remove_dir_if_there(&path)?;
-        fs::rename(&temporary, &path).with_context(|| format!("cannot rename {}", temporary.display()))?;
-        fail_point::reached("a checkpoint whose name is not yet synced");
-        files::sync_dir(dir);
-        Ok(path)
+        Ok(())
     }
 
     fn files(&self) -> Vec<(&'static str, Bytes)> {
