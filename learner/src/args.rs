@@ -2,6 +2,7 @@
 
 use std::path::PathBuf;
 use std::process::ExitCode;
+use std::time::Duration;
 
 use clap::error::ErrorKind;
 use clap::{Parser, Subcommand, ValueEnum};
@@ -73,6 +74,9 @@ pub struct TrainArgs {
     /// Stop, as after Ctrl-C, when standard input ends
     #[arg(long, hide = true)]
     pub with_parent: bool,
+    /// How it ends when it is asked to.
+    #[command(flatten)]
+    pub stop: StopFlags,
     /// Keys of the run.
     #[command(flatten)]
     pub run: RunFlags,
@@ -85,6 +89,21 @@ pub struct TrainArgs {
     /// Keys of `[ppo]`.
     #[command(flatten)]
     pub ppo: PpoFlags,
+}
+
+/// How a run ends when it is asked to.
+#[derive(Debug, clap::Args)]
+pub struct StopFlags {
+    /// After SIGTERM the run is saved and ends within as many seconds, 1 to 3600
+    #[arg(long, value_name = "SECONDS", default_value_t = 30, value_parser = clap::value_parser!(u64).range(1..=3600))]
+    pub grace: u64,
+}
+
+impl StopFlags {
+    /// The time between SIGTERM and the end.
+    pub fn grace(&self) -> Duration {
+        Duration::from_secs(self.grace)
+    }
 }
 
 /// Keys at the top of the configuration.
@@ -215,6 +234,9 @@ pub struct ResumeArgs {
     /// auto, cpu or cuda [default: as configured]
     #[arg(long, value_name = "D")]
     pub device: Option<String>,
+    /// How it ends when it is asked to.
+    #[command(flatten)]
+    pub stop: StopFlags,
     /// Keys of `[service]`.
     #[command(flatten)]
     pub service: ServiceFlags,

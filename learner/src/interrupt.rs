@@ -1,10 +1,13 @@
-//! Ctrl-C and SIGTERM: the first asks the run to end cleanly, the second ends the process at once.
+//! Ctrl-C and SIGTERM: the first asks the run to end cleanly, the second ends the process at once. After SIGTERM, with which
+//! schedulers announce SIGKILL, it also ends when its time of grace is over.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Duration;
 
 use anyhow::Context;
 use tokio::signal::unix::{SignalKind, signal};
+use tokio::time::{Instant, sleep_until};
 
 /// The exit status of a run that was interrupted.
 pub const EXIT_INTERRUPTED: u8 = 130;
@@ -13,16 +16,19 @@ pub const EXIT_INTERRUPTED: u8 = 130;
 #[derive(Clone, Debug, Default)]
 pub struct Interrupt {
     requested: Arc<AtomicBool>,
+    /// By SIGTERM, and not otherwise before.
+    terminated: Arc<AtomicBool>,
 }
 
 impl Interrupt {
-    /// Starts listening for signals, on a thread of its own.
+    /// Starts listening for signals, on a thread of its own. The process ends with status 1 where it has not ended `grace`
+    /// after SIGTERM; without it there is no such end.
     ///
     /// # Errors
     /// The signals cannot be listened for.
-    pub fn listen() -> anyhow::Result<Self> {
+    pub fn listen(grace: Option<Duration>) -> anyhow::Result<Self> {
         let interrupt = Self::default();
-        let requested = interrupt.requested.clone();
+        let Self { requested, terminated } = interrupt.clone();
         let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
         let (mut ctrl_c, mut terminate) = {
             let _guard = runtime.enter();
@@ -30,12 +36,22 @@ impl Interrupt {
         };
         let listen = move || {
             runtime.block_on(async {
+                let mut end = None;
                 loop {
-                    tokio::select! { _ = ctrl_c.recv() => {}, _ = terminate.recv() => {} }
+                    let by_scheduler = tokio::select! {
+                        _ = ctrl_c.recv() => false,
+                        _ = terminate.recv() => true,
+                        () = sleep_until(end.unwrap_or_else(Instant::now)), if end.is_some() => {
+                            tracing::error!("the time of grace is over: stopping at once, with the checkpoints that there are");
+                            signal_hook::low_level::exit(1);
+                        }
+                    };
                     if requested.swap(true, Ordering::SeqCst) {
                         // Not exit(): that would take libtorch apart while another thread is using it.
                         signal_hook::low_level::exit(i32::from(EXIT_INTERRUPTED));
                     }
+                    terminated.store(by_scheduler, Ordering::SeqCst);
+                    end = grace.filter(|_| by_scheduler).map(|grace| Instant::now() + grace);
                     tracing::info!("interrupted: saving and stopping; once more stops at once");
                 }
             });
@@ -57,6 +73,11 @@ impl Interrupt {
         };
         std::thread::Builder::new().name("parent".to_owned()).spawn(wait).context("no thread for the parent")?;
         Ok(())
+    }
+
+    /// With which status a run ends that was asked to: whoever sends SIGTERM expects 0.
+    pub fn exit_status(&self) -> u8 {
+        if self.terminated.load(Ordering::SeqCst) { 0 } else { EXIT_INTERRUPTED }
     }
 
     /// Whether a signal has come.

@@ -187,8 +187,10 @@ impl<'a> Session<'a> {
     /// Ends the service and the local actors. With a `reason` all actors are told that the run is complete; without one
     /// remote actors wait for the learner's return.
     pub fn end(self, reason: Option<&str>) {
-        if let (Some(service), Some(reason)) = (self.service, reason) {
-            service.finish(reason);
+        match (self.service, reason) {
+            (Some(service), Some(reason)) => service.finish(reason),
+            (Some(service), None) => service.pause(),
+            (None, _) => {}
         }
         if let Some(actors) = self.actors {
             actors.stop();

@@ -86,6 +86,9 @@ pub const KEEPALIVE_TIMEOUT: Duration = Duration::from_secs(10);
 /// A learner that ends waits this long for its actors to take their leave.
 pub const FINISH_DEADLINE: Duration = Duration::from_secs(5);
 
+/// Then its connections have this long to be closed.
+pub const CLOSE_DEADLINE: Duration = Duration::from_millis(500);
+
 /// HTTP/2 flow-control windows, of a stream and of a connection, in bytes.
 ///
 /// One session a connection, so both are equal. A window of 16 MiB keeps a 1 Gbit/s link with 100 ms round trip full

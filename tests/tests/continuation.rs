@@ -174,7 +174,7 @@ fn ctrl_c_saves_and_resume_completes(signal: Signal, lag: &str, checkpoint_epoch
     scene.reached(&mut learner, "run", 5);
     let actors = learner.actors();
     learner.signal(signal);
-    let log = learner.expect(130).stderr;
+    let log = learner.expect(if signal == Signal::TERM { 0 } else { 130 }).stderr;
     assert_eq!(log.matches("interrupted: saving and stopping").count(), 1, "{log}");
     Life::expect_gone(&actors);
     let rows = scene.rows("run");
@@ -205,6 +205,41 @@ fn ctrl_c_saves_and_resume_completes_with_lag() {
 #[test]
 fn sigterm_is_as_good_as_ctrl_c() {
     ctrl_c_saves_and_resume_completes(Signal::TERM, "0", "1");
+}
+
+#[test]
+fn remote_actors_are_told_to_wait() {
+    let scene = Scene::new();
+    let mut learner = scene.train("run", &[&["--actors", "0", "--listen", "127.0.0.1:0"], &STEPS[..]].concat());
+    let url = learner.url();
+    let mut actor = scene.actor(&url, &[]);
+    scene.reached(&mut learner, "run", 5);
+    learner.signal(Signal::TERM);
+    let log = learner.expect(0).stderr;
+    assert!(!log.contains("not all actors have gone"), "{log}");
+    actor.logged("(the learner was asked to stop; it may return); trying again");
+    let resumed = scene.resume("run", &["--listen", url.trim_start_matches("http://")]);
+    actor.expect(0);
+    resumed.expect(0);
+    assert_eq!(scene.accounted("run"), *UNDISTURBED);
+}
+
+#[test]
+fn sigterm_gives_a_time_of_grace() {
+    let scene = Scene::new();
+    let mut learner = scene.train("run", &[&STEPS[..], &["--grace", "1"]].concat());
+    scene.reached(&mut learner, "run", 5);
+    // An actor that does not react: the learner waits longer for it than it is given.
+    let actors = learner.actors();
+    actors.iter().for_each(|actor| actor.signal(Signal::STOP));
+    learner.signal(Signal::TERM);
+    let log = learner.expect(1).stderr;
+    assert!(log.contains("the time of grace is over"), "{log}");
+    actors.iter().for_each(|actor| actor.signal(Signal::CONT));
+    Life::expect_gone(&actors);
+    assert_eq!(scene.json("run/summary.json")["stopped_by"], "interrupt");
+    scene.resume("run", &[]).expect(0);
+    assert_eq!(scene.accounted("run"), *UNDISTURBED);
 }
 
 #[test]

@@ -64,7 +64,7 @@ const BAR: usize = 40;
 /// A directory without a run or without a checkpoint; actors that cannot be started.
 pub fn eval(args: &EvalArgs, extensions: &Extensions) -> Outcome {
     let (config, trained_on) = configure(args, extensions).map_err(Failure::Usage)?;
-    let interrupt = Interrupt::listen()?;
+    let interrupt = Interrupt::listen(None)?;
     let mut session = Session::new(&config, extensions)?;
     let checkpoint = choose_checkpoint(&args.dir, args.checkpoint, session.parameters())?
         .with_context(|| format!("{} holds no checkpoint yet", args.dir.display()))?;

@@ -85,7 +85,7 @@ pub fn study_run(args: &StudyRunArgs, extensions: &Extensions) -> Outcome {
     if args.retry_failed {
         wanted.iter().try_for_each(|trial| dir.forget_failures(trial))?;
     }
-    let interrupt = Interrupt::listen()?;
+    let interrupt = Interrupt::listen(None)?;
     let cores = std::thread::available_parallelism().map_or(1, std::num::NonZero::get);
     let jobs = args.jobs.map_or(cores, |jobs| jobs as usize);
     let tally = Runner::new(&dir, wanted, &interrupt).run(jobs)?;

@@ -10,7 +10,7 @@ use crate::args::{ResumeArgs, TrainArgs};
 use crate::checkpoint::Checkpoint;
 use crate::config::{self, Config, Purpose};
 use crate::files;
-use crate::interrupt::{EXIT_INTERRUPTED, Interrupt};
+use crate::interrupt::Interrupt;
 use crate::manifest;
 use crate::observer::{
     Curve, MetricsCsv, Observer, Progress, Prometheus, RunStart, SummaryJson, TensorBoard, TimingCsv,
@@ -25,6 +25,10 @@ use crate::trainer::Trainer;
 /// Bad configuration; a directory that cannot be used; a run that failed.
 pub fn train(args: &TrainArgs, extensions: Extensions) -> Outcome {
     let config = configure(args, &extensions).map_err(Failure::Usage)?;
+    let interrupt = Interrupt::listen(Some(args.stop.grace()))?;
+    if args.with_parent {
+        interrupt.with_parent()?;
+    }
     let path = args.out.clone().unwrap_or_else(|| RunDir::fresh(&config));
     if RunDir::holds_run(&path) {
         if !args.continue_run {
@@ -33,13 +37,13 @@ pub fn train(args: &TrainArgs, extensions: Extensions) -> Outcome {
         }
         let dir = continue_run(&path, &config, &extensions)?;
         let session = Session::new(&config, &extensions)?;
-        return carry_out(&dir, session, &config, extensions, args.with_parent);
+        return carry_out(&dir, session, &config, extensions, &interrupt);
     }
     // What can fail for want of an address or a program does so before there is a directory.
     let mut session = Session::new(&config, &extensions)?;
     session.listen()?;
     let dir = RunDir::create(&path, &config)?;
-    carry_out(&dir, session, &config, extensions, args.with_parent)
+    carry_out(&dir, session, &config, extensions, &interrupt)
 }
 
 /// Continues the run of a directory from its last checkpoint, or from the beginning if it has none.
@@ -58,7 +62,7 @@ pub fn resume(args: &ResumeArgs, extensions: Extensions) -> Outcome {
     let mut config = load(&flags).map_err(Failure::Usage)?;
     resolve_device(&mut config).map_err(Failure::Usage)?;
     let session = Session::new(&config, &extensions)?;
-    carry_out(&dir, session, &config, extensions, false)
+    carry_out(&dir, session, &config, extensions, &Interrupt::listen(Some(args.stop.grace()))?)
 }
 
 fn configure(args: &TrainArgs, extensions: &Extensions) -> anyhow::Result<Config> {
@@ -102,12 +106,8 @@ fn carry_out(
     mut session: Session<'_>,
     config: &Config,
     extensions: Extensions,
-    with_parent: bool,
+    interrupt: &Interrupt,
 ) -> Outcome {
-    let interrupt = Interrupt::listen()?;
-    if with_parent {
-        interrupt.with_parent()?;
-    }
     if run_dir::finished(dir.path(), config).is_some() {
         say(&format!("already complete: {}", dir.path().join(SummaryJson::FILE).display()))?;
         return Ok(0);
@@ -128,13 +128,13 @@ fn carry_out(
         service: session.service()?,
         observers,
         checkpoints: dir.checkpoints(),
-        interrupt: &interrupt,
+        interrupt,
         hopeless: session.hopeless(),
     };
     let summary = trainer.run(checkpoint)?;
     let interrupted = summary.stopped_by == "interrupt";
     session.end(if interrupted { None } else { Some("the run is complete") });
-    Ok(if interrupted { EXIT_INTERRUPTED } else { 0 })
+    Ok(if interrupted { interrupt.exit_status() } else { 0 })
 }
 
 fn observers(

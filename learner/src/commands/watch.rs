@@ -32,7 +32,7 @@ use crate::screen::terminal::Terminal;
 /// A directory without a run or without a checkpoint; no terminal; a file that cannot be written.
 pub fn watch(args: &WatchArgs, extensions: &Extensions) -> Outcome {
     // Before the first file is touched: an interrupt leaves none behind.
-    let interrupt = args.gif.is_some().then(Interrupt::listen).transpose()?;
+    let interrupt = args.gif.is_some().then(|| Interrupt::listen(None)).transpose()?;
     check(args).map_err(Failure::Usage)?;
     let mut spectator = prepare(args, extensions)?;
     let Some((path, interrupt)) = args.gif.as_ref().zip(interrupt) else {

@@ -30,8 +30,26 @@ pub(super) enum Event {
     Left { session: u64, reason: String },
     /// The trainer opens an epoch.
     Open { epoch: u64, weights: WeightSet, target: Target },
-    /// The trainer has finished: tell all actors, answer when they have gone.
-    Finish { reason: String, gone: oneshot::Sender<()> },
+    /// The trainer stops: tell all actors, answer when they have gone.
+    Finish { farewell: Farewell, gone: oneshot::Sender<()> },
+}
+
+/// Why the trainer stops.
+#[derive(Clone, Debug)]
+pub(super) enum Farewell {
+    /// The run is complete, for this reason: actors end.
+    Complete(String),
+    /// The run is to go on later: actors wait for a learner.
+    Pause,
+}
+
+impl Farewell {
+    fn order(&self) -> Order {
+        match self {
+            Self::Complete(reason) => Order::Stop { reason: reason.clone() },
+            Self::Pause => Order::End(Status::unavailable("the learner was asked to stop; it may return")),
+        }
+    }
 }
 
 /// What others may look at at any time.
@@ -80,7 +98,7 @@ pub(super) struct Coordinator {
     results: std::sync::mpsc::Sender<Collected>,
     shared: Arc<Shared>,
     account: Account,
-    finishing: Option<(String, oneshot::Sender<()>)>,
+    finishing: Option<(Farewell, oneshot::Sender<()>)>,
 }
 
 impl Coordinator {
@@ -139,11 +157,13 @@ impl Coordinator {
             Event::Episodes { session, batch } => self.receive(session, batch),
             Event::Left { session, reason } => self.leave(session, &reason),
             Event::Open { epoch, weights, target } => self.open(epoch, weights, target),
-            Event::Finish { reason, gone } => {
-                self.account.write(Entry::Finished { reason: &reason });
+            Event::Finish { farewell, gone } => {
+                if let Farewell::Complete(reason) = &farewell {
+                    self.account.write(Entry::Finished { reason });
+                }
                 self.epoch = None;
-                self.finishing = Some((reason.clone(), gone));
-                self.order_all(|_| Some(Order::Stop { reason: reason.clone() }));
+                self.order_all(|_| Some(farewell.order()));
+                self.finishing = Some((farewell, gone));
             }
         }
     }
@@ -177,8 +197,8 @@ impl Coordinator {
 
     /// Tells a newcomer how things stand.
     fn greet(&mut self, session: u64) {
-        if let Some((reason, _)) = &self.finishing {
-            self.order(session, Order::Stop { reason: reason.clone() });
+        if let Some((farewell, _)) = &self.finishing {
+            self.order(session, farewell.order());
         } else if self.epoch.is_some() {
             self.announce(session);
         }

@@ -45,7 +45,7 @@ pub use tls::TlsFiles;
 
 use account::{Account, Entry};
 use connections::{Gate, Peer};
-use coordinator::{Coordinator, Event, Shared};
+use coordinator::{Coordinator, Event, Farewell, Shared};
 use reloaded::Reloaded;
 use session::Terms;
 
@@ -91,6 +91,9 @@ pub struct Service {
     results: Receiver<Collected>,
     shared: Arc<Shared>,
     address: SocketAddr,
+    /// Sent to when the server is to end.
+    closing: oneshot::Sender<()>,
+    server: tokio::task::JoinHandle<()>,
     /// The epoch that was opened last.
     open: Cell<Option<u64>>,
 }
@@ -141,17 +144,19 @@ impl Service {
             let listener = runtime.block_on(async { tokio::net::TcpListener::from_std(listener) })?;
             runtime.spawn(connections::accept(transport::incoming(listener), tls, gate.clone(), accepted.clone()));
         }
-        runtime.spawn(async move {
+        let (closing, closed) = oneshot::channel::<()>();
+        let server = runtime.spawn(async move {
             let (health, health_service) = tonic_health::server::health_reporter();
             health.set_service_status(wire::learner_server::SERVICE_NAME, tonic_health::ServingStatus::Serving).await;
             let authorise = move |request| authorise(token.as_deref(), request);
             let service = InterceptedService::new(transport::service(endpoint), authorise);
             let server = transport::server().add_service(health_service).add_service(service);
-            if let Err(error) = server.serve_with_incoming(ReceiverStream::new(connections)).await {
+            let connections = ReceiverStream::new(connections);
+            if let Err(error) = server.serve_with_incoming_shutdown(connections, async { drop(closed.await) }).await {
                 tracing::error!("the service for actors has ended: {error}");
             }
         });
-        Ok(Self { runtime, events, results, shared, address, open: Cell::new(None) })
+        Ok(Self { runtime, events, results, shared, address, closing, server, open: Cell::new(None) })
     }
 
     /// Where it listens.
@@ -192,17 +197,29 @@ impl Service {
         }
     }
 
-    /// Tells all actors that the run is complete, and why, and waits a bounded time until they have gone. A service that
-    /// is dropped instead leaves them waiting for a learner to return.
+    /// Tells all actors that the run is complete, and why, and waits a bounded time until they have gone.
     pub fn finish(self, reason: &str) {
-        let (gone, all_gone) = oneshot::channel();
         let reason = reason.chars().take(limits::MAX_REASON_CHARS).collect();
-        if self.events.blocking_send(Event::Finish { reason, gone }).is_ok() {
+        self.end(Farewell::Complete(reason));
+    }
+
+    /// As [`finish`](Self::finish), but actors are told to wait for a learner to return, as they also do where the service is
+    /// dropped without a word.
+    pub fn pause(self) {
+        self.end(Farewell::Pause);
+    }
+
+    fn end(self, farewell: Farewell) {
+        let (gone, all_gone) = oneshot::channel();
+        if self.events.blocking_send(Event::Finish { farewell, gone }).is_ok() {
             let wait = async { tokio::time::timeout(limits::FINISH_DEADLINE, all_gone).await };
             if self.runtime.block_on(wait).is_err() {
                 tracing::warn!(actors = self.actors(), "not all actors have gone in time");
             }
         }
+        // Their last words may still be on their way. Whoever does not go now is cut off.
+        let _ = self.closing.send(());
+        let _ = self.runtime.block_on(async { tokio::time::timeout(limits::CLOSE_DEADLINE, self.server).await });
         self.runtime.shutdown_timeout(Duration::from_secs(1));
     }
 }
