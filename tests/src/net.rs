@@ -1,8 +1,8 @@
-//! A free port, a plain HTTP request, the health service, a network that can be cut, and a learner that refuses.
+//! A free port, a plain HTTP request, the health service, a network that can be cut and stalled, and a learner that refuses.
 
 use std::io::{self, Read as _, Write as _};
 use std::net::{Shutdown, SocketAddr, TcpListener, TcpStream};
-use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 
 use popgym_proto::{ActorMessage, Hello, LearnerMessage, transport, wire};
@@ -11,7 +11,7 @@ use tonic_health::pb::HealthCheckRequest;
 use tonic_health::pb::health_check_response::ServingStatus;
 use tonic_health::pb::health_client::HealthClient;
 
-use crate::{DEADLINE, until};
+use crate::{DEADLINE, POLL_INTERVAL, until};
 
 /// An address on this machine that nobody listens on.
 ///
@@ -58,7 +58,7 @@ pub fn health(url: &str, service: &str) -> ServingStatus {
     })
 }
 
-/// A network between actors and a learner: passes on what comes, until it is cut.
+/// A network between actors and a learner: passes on what comes, until it is cut, and while it is not stalled.
 #[derive(Debug)]
 pub struct Network {
     address: SocketAddr,
@@ -70,6 +70,7 @@ struct Wires {
     open: Mutex<Vec<TcpStream>>,
     /// Bytes that have gone from the near end to the far end.
     sent: AtomicUsize,
+    stalled: AtomicBool,
 }
 
 impl Network {
@@ -101,6 +102,11 @@ impl Network {
         self.wires.sent.load(Ordering::SeqCst)
     }
 
+    /// Whether what comes is held back.
+    pub fn stall(&self, stalled: bool) {
+        self.wires.stalled.store(stalled, Ordering::SeqCst);
+    }
+
     /// Cuts every connection. New ones are taken.
     pub fn cut(&self) {
         for connection in self.wires.open.lock().unwrap_or_else(PoisonError::into_inner).drain(..) {
@@ -118,6 +124,9 @@ fn connect(near: &TcpStream, far: &TcpStream, wires: &Arc<Wires>) -> io::Result<
         std::thread::spawn(move || {
             let mut buffer = vec![0; 1 << 16];
             while let Ok(length @ 1..) = from.read(&mut buffer) {
+                while wires.stalled.load(Ordering::SeqCst) {
+                    std::thread::sleep(POLL_INTERVAL);
+                }
                 wires.sent.fetch_add(if counted { length } else { 0 }, Ordering::SeqCst);
                 if to.write_all(&buffer[..length]).is_err() {
                     break;
