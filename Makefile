@@ -12,7 +12,7 @@ ARGS ?=
 # Another libtorch of the user's would be compiled against but not found at run time.
 unexport LIBTORCH LIBTORCH_INCLUDE LIBTORCH_LIB LIBTORCH_STATIC LIBTORCH_USE_PYTORCH
 
-.PHONY: help setup build train test lint bench clean
+.PHONY: help setup build train test soak lint bench clean
 
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "make %-8s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -28,6 +28,9 @@ train: build ## train until the agent has mastered its task; more options with A
 
 test: setup ## all tests
 	$(CARGO) test $(CARGO_FLAGS) --workspace
+
+soak: setup ## the long forms of tests: 200 random faults in a run, hostile actors for minutes, with their figures
+	POPGYM_SOAK=1 $(CARGO) test $(CARGO_FLAGS) --workspace --test soak -- --nocapture --test-threads 1
 
 lint: setup ## formatting, clippy, and licences and advisories where cargo-deny is installed
 	$(CARGO) fmt --all --check
