@@ -16,7 +16,7 @@ pub const EXIT_INTERRUPTED: u8 = 130;
 #[derive(Clone, Debug, Default)]
 pub struct Interrupt {
     requested: Arc<AtomicBool>,
-    /// By SIGTERM, and not otherwise before.
+    /// Whether it was SIGTERM; set before the other.
     terminated: Arc<AtomicBool>,
 }
 
@@ -46,11 +46,12 @@ impl Interrupt {
                             signal_hook::low_level::exit(1);
                         }
                     };
-                    if requested.swap(true, Ordering::SeqCst) {
+                    if requested.load(Ordering::SeqCst) {
                         // Not exit(): that would take libtorch apart while another thread is using it.
                         signal_hook::low_level::exit(i32::from(EXIT_INTERRUPTED));
                     }
                     terminated.store(by_scheduler, Ordering::SeqCst);
+                    requested.store(true, Ordering::SeqCst);
                     end = grace.filter(|_| by_scheduler).map(|grace| Instant::now() + grace);
                     tracing::info!("interrupted: saving and stopping; once more stops at once");
                 }

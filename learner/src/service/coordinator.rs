@@ -162,8 +162,8 @@ impl Coordinator {
                     self.account.write(Entry::Finished { reason });
                 }
                 self.epoch = None;
+                self.finishing = Some((farewell.clone(), gone));
                 self.order_all(|_| Some(farewell.order()));
-                self.finishing = Some((farewell, gone));
             }
         }
     }
