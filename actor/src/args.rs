@@ -43,8 +43,8 @@ pub struct Args {
     #[arg(long, env = "POPGYM_RUN", value_name = "ID", value_parser = name)]
     pub run: Option<String>,
 
-    /// Serve Prometheus metrics here, for example 0.0.0.0:9100; off if not given
-    #[arg(long, env = "POPGYM_ACTOR_METRICS_LISTEN", value_name = "ADDR")]
+    /// Serve Prometheus metrics here: PORT, for this machine alone, or IP:PORT; off if not given
+    #[arg(long, env = "POPGYM_ACTOR_METRICS_LISTEN", value_name = "ADDR", value_parser = transport::metrics_address)]
     pub metrics_listen: Option<SocketAddr>,
 
     /// Give up when there has been no learner for this long

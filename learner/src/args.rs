@@ -183,7 +183,7 @@ pub struct ServiceFlags {
     #[arg(long, value_name = "ADDR")]
     #[serde(skip_serializing_if = "Option::is_none")]
     pub listen: Option<String>,
-    /// Address for Prometheus [default: none]
+    /// Address for Prometheus: PORT, for this machine alone, or IP:PORT [default: none]
     #[arg(long, value_name = "ADDR")]
     #[serde(skip_serializing_if = "Option::is_none")]
     pub metrics_listen: Option<String>,

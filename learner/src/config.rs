@@ -3,13 +3,13 @@
 //! All three are TOML tables of the same keys. The preset's table is complete, so a key that it lacks is unknown; the
 //! file's table goes over it, and the flags' over both.
 
-use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, bail};
 use popgym_envs::{EnvSpec, Observability};
 use popgym_models::{Policy, PolicyOptions, PolicySpec, memory};
 use popgym_proto::RunSpec;
+use popgym_proto::transport::metrics_address;
 use serde::{Deserialize, Serialize};
 use tch::Device;
 use toml::{Table, Value};
@@ -78,7 +78,7 @@ pub struct ServiceConfig {
     pub actor_command: Vec<String>,
     /// Address for actors; empty: any free port of this machine for local actors, port 50051 of this machine for others.
     pub listen: String,
-    /// Address for Prometheus; empty: none.
+    /// Address for Prometheus: a port, for this machine alone, or IP:PORT; empty: none.
     pub metrics_listen: String,
     /// File of the token that actors must show; empty: none.
     pub token_file: String,
@@ -289,8 +289,8 @@ impl Config {
         if !listen.is_empty() && !listen.rsplit_once(':').is_some_and(is_address) {
             bail!("service.listen is `{listen}`, allowed is HOST:PORT");
         }
-        if !metrics_listen.is_empty() && metrics_listen.parse::<SocketAddr>().is_err() {
-            bail!("service.metrics_listen is `{metrics_listen}`, allowed is IP:PORT");
+        if !metrics_listen.is_empty() {
+            metrics_address(metrics_listen).map_err(|problem| anyhow::anyhow!("service.{problem}"))?;
         }
         self.service.validate_tls()?;
         if self.stop_at_mmer.is_some_and(f64::is_nan) {

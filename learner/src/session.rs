@@ -7,6 +7,7 @@ use std::path::Path;
 use anyhow::Context;
 use popgym_envs::{EnvSpec, Purpose, Space, stream};
 use popgym_models::{Policy, PolicySpec, memory};
+use popgym_proto::transport::metrics_address;
 use popgym_proto::{EpisodeSpec, fingerprint};
 use rand::Rng as _;
 use tch::Device;
@@ -217,10 +218,9 @@ fn check_exposure(entrance: &Entrance, service: &ServiceConfig) -> anyhow::Resul
 }
 
 fn serve_metrics(address: &str) -> anyhow::Result<()> {
-    let parsed: std::net::SocketAddr =
-        address.parse().with_context(|| format!("metrics_listen is `{address}`, allowed is IP:PORT"))?;
+    let address = metrics_address(address).map_err(anyhow::Error::msg)?;
     metrics_exporter_prometheus::PrometheusBuilder::new()
-        .with_http_listener(parsed)
+        .with_http_listener(address)
         .install()
         .with_context(|| format!("cannot serve metrics on {address}"))?;
     crate::observer::Prometheus::describe();

@@ -1,11 +1,31 @@
 //! Connection settings of both sides: nothing that matters is left to a default.
 
+use std::net::{Ipv4Addr, SocketAddr};
+
 use tonic::transport::server::TcpIncoming;
 use tonic::transport::{Channel, Endpoint, Server};
 
 use crate::limits;
 use crate::wire::learner_client::LearnerClient;
 use crate::wire::learner_server::{Learner, LearnerServer};
+
+/// The address of a metrics port: `IP:PORT`, or `PORT` for one that only this machine reaches.
+///
+/// # Errors
+/// A text that is neither.
+///
+/// ```
+/// use popgym_proto::transport::metrics_address;
+///
+/// assert_eq!(metrics_address("9100"), Ok("127.0.0.1:9100".parse().unwrap()));
+/// assert_eq!(metrics_address("[::]:9100"), Ok("[::]:9100".parse().unwrap()));
+/// assert!(metrics_address("localhost").is_err());
+/// ```
+pub fn metrics_address(text: &str) -> Result<SocketAddr, String> {
+    let port = text.parse().map(|port: u16| (Ipv4Addr::LOCALHOST, port).into());
+    port.or_else(|_| text.parse())
+        .map_err(|_| format!("metrics_listen is `{text}`, allowed is IP:PORT, or PORT for this machine alone"))
+}
 
 /// The actor's end of a connection to the learner at `url` (`http://host:port`). Connects to nothing yet.
 ///

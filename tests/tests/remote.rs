@@ -165,8 +165,11 @@ fn an_actor_with_a_parent_ends_with_it() {
 fn prometheus_watches_both_sides() {
     let scene = Scene::new();
     let (learner_metrics, actor_metrics) = (net::free_address(), net::free_address());
-    let (mut learner, url) = waiting(&scene, &["--metrics-listen", &learner_metrics, "--steps", "1000000"]);
-    let mut actor = scene.actor(&url, &["--metrics-listen", &actor_metrics]);
+    // A port alone is one of this machine.
+    let port = |address: &str| address.trim_start_matches("127.0.0.1:").to_owned();
+    let (learner_port, actor_port) = (port(&learner_metrics), port(&actor_metrics));
+    let (mut learner, url) = waiting(&scene, &["--metrics-listen", &learner_port, "--steps", "1000000"]);
+    let mut actor = scene.actor(&url, &["--metrics-listen", &actor_port]);
     scene.reached(&mut learner, "run", 3);
     let text =
         net::get(&learner_metrics, "/metrics", &["popgym_learner_leases_outstanding", "popgym_learner_return_mmer "]);
