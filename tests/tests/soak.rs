@@ -21,6 +21,10 @@ const REMOTE: usize = 3;
 /// Steps of a run that ends only when it is asked to.
 const ENDLESS: &str = "1000000000000";
 
+/// After this long a learner has all the memory that it will have: it draws the curve's picture for the second time after a
+/// minute, and the allocator then keeps the room.
+const SETTLED: Duration = Duration::from_secs(70);
+
 /// Steps after the last fault.
 const REST: u64 = 8192;
 
@@ -282,7 +286,10 @@ fn survives(lag: &str) {
     for fault in 0..faults {
         let first_half = fault < faults / 2;
         if !first_half {
-            let before = *descriptors.get_or_insert_with(|| fleet.complete());
+            let before = *descriptors.get_or_insert_with(|| {
+                fleet.go_on(if whole() { SETTLED } else { Duration::ZERO });
+                fleet.complete()
+            });
             fleet.weigh();
             if fault + 1 == faults {
                 until("no more descriptors than before", || (fleet.complete() <= before).then_some(()));
