@@ -99,12 +99,17 @@ fn observability(value: &str) -> Result<Observability, WireError> {
 }
 
 fn table(field: &'static str, text: &str) -> Result<toml::Table, WireError> {
-    if text.len() > limits::MAX_OPTIONS_BYTES {
-        let allowed = format!("0..={} bytes", limits::MAX_OPTIONS_BYTES);
-        return Err(WireError::Length { field, length: text.len(), allowed });
-    }
-    toml::from_str(text)
-        .map_err(|error: toml::de::Error| WireError::Toml { field, problem: error.message().trim().to_owned() })
+    let check = |length: usize| {
+        let allowed = || format!("0..={} bytes", limits::MAX_OPTIONS_BYTES);
+        let fits = length <= limits::MAX_OPTIONS_BYTES;
+        if fits { Ok(()) } else { Err(WireError::Length { field, length, allowed: allowed() }) }
+    };
+    check(text.len())?;
+    let table: toml::Table = toml::from_str(text)
+        .map_err(|error: toml::de::Error| WireError::Toml { field, problem: error.message().trim().to_owned() })?;
+    // Its own text can be longer: `1e300` is written out.
+    check(table.to_string().len())?;
+    Ok(table)
 }
 
 /// The first message of an actor: who it is.

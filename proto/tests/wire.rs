@@ -9,6 +9,11 @@ use popgym_proto::{
 use proptest::prelude::*;
 use prost::Message;
 
+#[path = "common/legal.rs"]
+mod legal;
+
+use legal::{assert_legal_actor, assert_legal_learner};
+
 /// The spaces of RepeatPreviousEasy.
 fn repeat_previous() -> EpisodeSpec {
     EpisodeSpec { observation: Space::Discrete(4), action: Space::MultiDiscrete(vec![4]), max_steps: 64 }
@@ -49,30 +54,6 @@ fn episode(spec: &EpisodeSpec, index: u64, steps: usize, seed: u32) -> Episode {
     }
 }
 
-/// Written without a look at the code under test.
-fn assert_legal(episode: &Episode, spec: &EpisodeSpec) {
-    assert!(episode.steps >= 1 && episode.steps <= spec.max_steps as usize);
-    assert!(episode.terminated || episode.truncated);
-    assert_eq!(episode.rewards.len(), episode.steps);
-    assert_eq!(episode.log_probs.len(), episode.steps);
-    assert!(episode.rewards.iter().all(|x| x.is_finite()));
-    assert!(episode.log_probs.iter().all(|x| x.is_finite()));
-    for (columns, space, rows) in
-        [(&episode.observations, &spec.observation, episode.steps + 1), (&episode.actions, &spec.action, episode.steps)]
-    {
-        let (mut discrete, mut real) = (columns.discrete.iter(), columns.real.iter());
-        for _ in 0..rows {
-            for leaf in space.leaves() {
-                match leaf {
-                    Leaf::Discrete { classes } => assert!(u16::from(*discrete.next().unwrap()) < classes),
-                    Leaf::Real { .. } => assert!(real.next().unwrap().is_finite()),
-                }
-            }
-        }
-        assert!(discrete.next().is_none() && real.next().is_none());
-    }
-}
-
 fn batch_bytes(spec: &EpisodeSpec, sizes: &[usize], seed: u32) -> (EpisodeBatch, Vec<u8>) {
     let episodes =
         sizes.iter().enumerate().map(|(i, &steps)| episode(spec, i as u64, steps, seed + i as u32)).collect();
@@ -84,9 +65,7 @@ fn batch_bytes(spec: &EpisodeSpec, sizes: &[usize], seed: u32) -> (EpisodeBatch,
 /// Decodes and checks as the learner does; what passes must be legal.
 fn receive(bytes: &[u8], spec: &EpisodeSpec) -> Option<ActorMessage> {
     let message = ActorMessage::from_wire(wire::FromActor::decode(bytes).ok()?, spec).ok()?;
-    if let ActorMessage::Episodes(batch) = &message {
-        batch.episodes.iter().for_each(|episode| assert_legal(episode, spec));
-    }
+    assert_legal_actor(&message, spec);
     Some(message)
 }
 
@@ -112,8 +91,9 @@ proptest! {
     #[test]
     fn noise_never_panics(bytes in prop::collection::vec(any::<u8>(), 0..400)) {
         receive(&bytes, &mixed());
-        if let Ok(message) = wire::FromLearner::decode(&bytes[..]) {
-            let _ = LearnerMessage::from_wire(message);
+        let message = wire::FromLearner::decode(&bytes[..]);
+        if let Ok(Ok(message)) = message.map(LearnerMessage::from_wire) {
+            assert_legal_learner(&message);
         }
     }
 }
@@ -228,6 +208,9 @@ fn a_run_survives_the_wire() {
     assert!(refused(&|r| r.policy_options = "[".repeat(100_000)).starts_with("policy_options has length 100000"));
     // Deep nesting must neither overflow the stack nor pass.
     assert!(refused(&|r| r.policy_options = format!("x = {}", "[".repeat(60_000))).contains("not TOML"));
+    // What is longer when it is sent on.
+    let floats = format!("x = [{}]", "1e300, ".repeat(1000));
+    assert!(refused(&|r| r.policy_options = floats.clone()).starts_with("policy_options has length 30"));
 }
 
 #[test]
