@@ -27,6 +27,8 @@ const WEIGHTS: &str = "weights.safetensors";
 const SAMPLING: &str = "sampling.safetensors";
 const OPTIMIZER: &str = "optimizer.safetensors";
 const TEMPORARY_SUFFIX: &str = ".tmp";
+/// No run comes to as many epochs, steps, episodes or updates.
+const MAX_COUNT: u64 = 1 << 53;
 
 /// The numbers of a run after some epochs.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -72,6 +74,28 @@ struct Manifest {
     files: BTreeMap<String, String>,
 }
 
+impl Manifest {
+    fn parse(bytes: &[u8]) -> anyhow::Result<Self> {
+        let manifest: Self = serde_json::from_slice(bytes).with_context(|| format!("{MANIFEST} is not a manifest"))?;
+        ensure!(manifest.format == FORMAT, "{MANIFEST} has format {}, expected {FORMAT}", manifest.format);
+        let Progress { epoch, env_steps, episodes, .. } = manifest.progress;
+        let counts = [
+            ("epoch", epoch),
+            ("env_steps", env_steps),
+            ("episodes", episodes),
+            ("optimizer_steps", manifest.optimizer_steps),
+        ];
+        for (key, count) in counts {
+            ensure!(count <= MAX_COUNT, "{MANIFEST}: {key} is {count}, allowed is at most {MAX_COUNT}");
+        }
+        for (key, number) in [("kl_coef", manifest.progress.kl_coef), ("wall_seconds", manifest.progress.wall_seconds)]
+        {
+            ensure!(number >= 0.0, "{MANIFEST}: {key} is {number}, allowed is 0 or more");
+        }
+        Ok(manifest)
+    }
+}
+
 /// Where below `dir` the checkpoint of the first `epoch` epochs is.
 pub(crate) fn path(dir: &Path, epoch: u64) -> PathBuf {
     dir.join(format!("epoch-{epoch:06}"))
@@ -102,27 +126,24 @@ impl Checkpoint {
 
     fn write(&self, temporary: &Path, about: &Value) -> anyhow::Result<()> {
         fs::create_dir_all(temporary).with_context(|| format!("cannot create {}", temporary.display()))?;
-        let mut files = BTreeMap::new();
-        for (name, bytes) in self.files() {
-            fail_point::reached("a checkpoint without all its files");
+        for (name, bytes) in self.to_files(about)? {
+            fail_point::reached(if name == MANIFEST {
+                "a checkpoint without its manifest"
+            } else {
+                "a checkpoint without all its files"
+            });
             write_synced(&temporary.join(name), &bytes)?;
-            files.insert(name.to_owned(), hex_digest(&bytes));
         }
-        fail_point::reached("a checkpoint without its manifest");
-        let manifest = Manifest {
-            format: FORMAT,
-            about: about.clone(),
-            progress: self.progress.clone(),
-            optimizer_steps: self.optimizer.steps,
-            files,
-        };
-        write_synced(&temporary.join(MANIFEST), &serde_json::to_vec_pretty(&manifest)?)?;
         files::sync_dir(temporary);
         fail_point::reached("a checkpoint under its temporary name");
         Ok(())
     }
 
-    fn files(&self) -> Vec<(&'static str, Bytes)> {
+    /// The checkpoint's files by name, the manifest last. `about` is kept in the manifest.
+    ///
+    /// # Errors
+    /// None that a run can cause.
+    pub fn to_files(&self, about: &Value) -> anyhow::Result<Vec<(&'static str, Bytes)>> {
         let moments = BTreeMap::from([
             ("first_moment".to_owned(), self.optimizer.first_moment.shallow_clone()),
             ("second_moment".to_owned(), self.optimizer.second_moment.shallow_clone()),
@@ -131,7 +152,15 @@ impl Checkpoint {
         if self.sampling != self.weights {
             files.push((SAMPLING, self.sampling.clone()));
         }
-        files
+        let manifest = Manifest {
+            format: FORMAT,
+            about: about.clone(),
+            progress: self.progress.clone(),
+            optimizer_steps: self.optimizer.steps,
+            files: files.iter().map(|(name, bytes)| ((*name).to_owned(), hex_digest(bytes))).collect(),
+        };
+        files.push((MANIFEST, serde_json::to_vec_pretty(&manifest)?.into()));
+        Ok(files)
     }
 
     /// Reads the checkpoint at `path`; its optimiser has `parameters` numbers.
@@ -139,18 +168,27 @@ impl Checkpoint {
     /// # Errors
     /// A file that is missing, cannot be read, or is not what the manifest says.
     pub fn load(path: &Path, parameters: i64) -> anyhow::Result<Self> {
-        let manifest = read_manifest(path)?;
+        Self::from_files(parameters, |name| read(&path.join(name))).with_context(|| path.display().to_string())
+    }
+
+    /// A checkpoint of the files that `read` gives by name; its optimiser has `parameters` numbers.
+    ///
+    /// # Errors
+    /// A file that `read` does not give, or that is not what the manifest says; numbers that no run comes to.
+    pub fn from_files(parameters: i64, read: impl Fn(&str) -> anyhow::Result<Bytes>) -> anyhow::Result<Self> {
+        let manifest = Manifest::parse(&read(MANIFEST)?)?;
         let mut files = BTreeMap::new();
         for (name, digest) in &manifest.files {
-            let file = path.join(name);
-            let bytes = fs::read(&file).with_context(|| format!("cannot read {}", file.display()))?;
-            ensure!(hex_digest(&bytes) == *digest, "{} is damaged: its SHA-256 is not the manifest's", file.display());
-            files.insert(name.as_str(), Bytes::from(bytes));
+            // A path would lead out of the checkpoint.
+            ensure!([WEIGHTS, SAMPLING, OPTIMIZER].contains(&name.as_str()), "{MANIFEST} names a file `{name}`");
+            let bytes = read(name)?;
+            ensure!(hex_digest(&bytes) == *digest, "{name} is damaged: its SHA-256 is not the manifest's");
+            files.insert(name.as_str(), bytes);
         }
-        let get = |name: &str| files.get(name).cloned().with_context(|| format!("{} lacks {name}", path.display()));
+        let get = |name: &str| files.get(name).cloned().with_context(|| format!("{MANIFEST} lacks {name}"));
         let zeros = || Tensor::zeros([parameters], (Kind::Float, tch::Device::Cpu));
         let moments = BTreeMap::from([("first_moment".to_owned(), zeros()), ("second_moment".to_owned(), zeros())]);
-        weights::load_into(&moments, &get(OPTIMIZER)?).with_context(|| path.join(OPTIMIZER).display().to_string())?;
+        weights::load_into(&moments, &get(OPTIMIZER)?).context(OPTIMIZER)?;
         let moment = |name: &str| moments[name].shallow_clone();
         Ok(Self {
             progress: manifest.progress,
@@ -226,7 +264,8 @@ pub fn list(dir: &Path) -> anyhow::Result<Vec<PathBuf>> {
 /// # Errors
 /// The directory cannot be read.
 pub fn best(dir: &Path) -> anyhow::Result<Option<PathBuf>> {
-    let score = |path: &PathBuf| read_manifest(path).ok().and_then(|manifest| manifest.progress.mean_return);
+    let manifest = |path: &PathBuf| Manifest::parse(&read(&path.join(MANIFEST)).ok()?).ok();
+    let score = |path: &PathBuf| manifest(path).and_then(|manifest| manifest.progress.mean_return);
     let scored = list(dir)?.into_iter().filter_map(|path| score(&path).map(|score| (score, path)));
     Ok(scored.max_by(|a, b| a.0.total_cmp(&b.0)).map(|(_, path)| path))
 }
@@ -248,13 +287,8 @@ pub fn prune(dir: &Path, keep: usize) -> anyhow::Result<()> {
     Ok(())
 }
 
-fn read_manifest(path: &Path) -> anyhow::Result<Manifest> {
-    let file = path.join(MANIFEST);
-    let bytes = fs::read(&file).with_context(|| format!("cannot read {}", file.display()))?;
-    let manifest: Manifest =
-        serde_json::from_slice(&bytes).with_context(|| format!("{} is not a manifest", file.display()))?;
-    ensure!(manifest.format == FORMAT, "{} has format {}, expected {FORMAT}", file.display(), manifest.format);
-    Ok(manifest)
+fn read(path: &Path) -> anyhow::Result<Bytes> {
+    fs::read(path).map(Bytes::from).with_context(|| format!("cannot read {}", path.display()))
 }
 
 fn write_synced(path: &Path, bytes: &[u8]) -> anyhow::Result<()> {

@@ -14,6 +14,10 @@ use crate::config::{self, Config, nearest};
 /// Every environment, or every memory.
 const ALL: &str = "all";
 
+/// Most combinations of a study, those counted again that several products name: some ten times the whole benchmark with
+/// every memory. A trial's number has four digits.
+pub const MAX_TRIALS: usize = 10_000;
+
 /// A study file, as it is written.
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -77,36 +81,104 @@ pub fn read(path: &Path, extensions: &Extensions) -> anyhow::Result<(String, Vec
 /// # Errors
 /// As [`read`].
 pub fn parse(text: &str, extensions: &Extensions) -> anyhow::Result<Vec<Trial>> {
-    let file: File = toml::from_str(text).map_err(|error| anyhow::anyhow!(config::one_line(&error)))?;
-    check_run(&file.run).context("[run]")?;
-    ensure!(!file.products.is_empty(), "there is no [[product]] of environments, memories and seeds");
-    let selections = selections(&file.overrides, extensions)?;
-    let mut trials = Vec::new();
-    let mut known = BTreeSet::new();
-    for (product, number) in file.products.iter().zip(1..) {
-        let of_product = || format!("[[product]] {number}");
-        let envs = envs(&product.envs, extensions).with_context(of_product)?;
-        let memories = memories(&product.memories, extensions).with_context(of_product)?;
-        ensure!(!product.seeds.is_empty(), "{}: seeds is empty, allowed are one or more numbers", of_product());
-        for env in envs {
-            for memory in &memories {
-                for &seed in &product.seeds {
-                    if known.insert((env.id().to_owned(), memory.clone(), seed)) {
-                        let given = given(&file.run, &selections, env, memory, seed);
-                        trials.push(trial(trials.len(), env, &given, extensions)?);
+    let plan = Plan::parse(text, extensions)?;
+    (0..plan.combinations.len()).map(|number| plan.trial(number)).collect()
+}
+
+/// A study whose combinations are known and whose configurations are not resolved yet.
+pub struct Plan<'a> {
+    extensions: &'a Extensions,
+    run: Table,
+    selections: Vec<Selection>,
+    combinations: Vec<Combination<'a>>,
+}
+
+/// What makes a trial itself.
+struct Combination<'a> {
+    env: &'a Entry,
+    memory: String,
+    seed: u64,
+}
+
+impl<'a> Plan<'a> {
+    /// What a study file's text means.
+    ///
+    /// # Errors
+    /// What in it is unknown or empty; more than [`MAX_TRIALS`] combinations.
+    pub fn parse(text: &str, extensions: &'a Extensions) -> anyhow::Result<Self> {
+        let file: File = toml::from_str(text).map_err(|error| anyhow::anyhow!(config::one_line(&error)))?;
+        check_run(&file.run).context("[run]")?;
+        ensure!(!file.products.is_empty(), "there is no [[product]] of environments, memories and seeds");
+        let selections = selections(file.overrides, extensions)?;
+        let (mut combinations, mut known, mut named) = (Vec::new(), BTreeSet::new(), 0_usize);
+        for (product, number) in file.products.iter().zip(1..) {
+            let of_product = || format!("[[product]] {number}");
+            let envs = envs(&product.envs, extensions).with_context(of_product)?;
+            let memories = memories(&product.memories, extensions).with_context(of_product)?;
+            ensure!(!product.seeds.is_empty(), "{}: seeds is empty, allowed are one or more numbers", of_product());
+            named = named.saturating_add(envs.len() * memories.len() * product.seeds.len());
+            ensure!(
+                named <= MAX_TRIALS,
+                "{}: that makes {named} combinations, allowed are at most {MAX_TRIALS} in a study",
+                of_product()
+            );
+            for env in envs {
+                for memory in &memories {
+                    for &seed in &product.seeds {
+                        if known.insert((env.id().to_owned(), memory.clone(), seed)) {
+                            combinations.push(Combination { env, memory: memory.clone(), seed });
+                        }
                     }
                 }
             }
         }
+        Ok(Self { extensions, run: file.run, selections, combinations })
     }
-    Ok(trials)
-}
 
-fn trial(number: usize, env: &Entry, given: &Table, extensions: &Extensions) -> anyhow::Result<Trial> {
-    let config = Config::resolve(given, &Table::new(), &extensions.envs, &extensions.memories);
-    let config = config.with_context(|| format!("trial {number}, {}", env.name))?;
-    let name = format!("{number:04}-{}-{}-seed{}", env.name, config.memory_name(), config.seed);
-    Ok(Trial { number, name, env: env.name.clone(), config })
+    /// How many trials there are, at least one.
+    #[expect(clippy::len_without_is_empty, reason = "it never is")]
+    pub fn len(&self) -> usize {
+        self.combinations.len()
+    }
+
+    /// The trial of this number, from 0.
+    ///
+    /// # Errors
+    /// There is none; or what in its configuration is unknown or impossible.
+    pub fn trial(&self, number: usize) -> anyhow::Result<Trial> {
+        let this = self.combinations.get(number).with_context(|| format!("there is no trial {number}"))?;
+        let config =
+            Config::resolve(&self.given(this), &Table::new(), &self.extensions.envs, &self.extensions.memories);
+        let config = config.with_context(|| format!("trial {number}, {}", this.env.name))?;
+        let name = format!("{number:04}-{}-{}-seed{}", this.env.name, config.memory_name(), config.seed);
+        Ok(Trial { number, name, env: this.env.name.clone(), config })
+    }
+
+    /// The keys of one trial's configuration.
+    fn given(&self, this: &Combination<'_>) -> Table {
+        let mut given = Table::from_iter([
+            ("threads".to_owned(), Value::Integer(1)),
+            ("device".to_owned(), Value::String("cpu".to_owned())),
+            ("service".to_owned(), Value::Table(Table::from_iter([("actors".to_owned(), Value::Integer(1))]))),
+        ]);
+        config::merge(&mut given, &self.run);
+        for selection in &self.selections {
+            let has = |list: &Option<Vec<String>>, name: &str| {
+                list.as_ref().is_none_or(|list| list.iter().any(|known| known == name))
+            };
+            if has(&selection.envs, this.env.id()) && has(&selection.memories, &this.memory) {
+                config::merge(&mut given, &selection.run);
+            }
+        }
+        let memory = Table::from_iter([("name".to_owned(), Value::String(this.memory.clone()))]);
+        let itself = Table::from_iter([
+            ("env".to_owned(), Value::String(this.env.id().to_owned())),
+            ("seed".to_owned(), Value::Integer(this.seed as i64)),
+            ("memory".to_owned(), Value::Table(memory)),
+        ]);
+        config::merge(&mut given, &itself);
+        given
+    }
 }
 
 /// The first difference that keeps a directory of the trials `old` from going on as one of `new`: trials may only be
@@ -126,25 +198,25 @@ pub fn difference(old: &[Trial], new: &[Trial]) -> Option<String> {
 }
 
 /// What an override is for, resolved to environments' ids and memories' names; `None`: for all.
-struct Selection<'a> {
+struct Selection {
     envs: Option<Vec<String>>,
     memories: Option<Vec<String>>,
-    run: &'a Table,
+    run: Table,
 }
 
-fn selections<'a>(overrides: &'a [Override], extensions: &Extensions) -> anyhow::Result<Vec<Selection<'a>>> {
-    let numbered = overrides.iter().zip(1..);
+fn selections(overrides: Vec<Override>, extensions: &Extensions) -> anyhow::Result<Vec<Selection>> {
+    let numbered = overrides.into_iter().zip(1..);
     numbered
         .map(|(this, number)| selection(this, extensions).with_context(|| format!("[[override]] {number}")))
         .collect()
 }
 
-fn selection<'a>(this: &'a Override, extensions: &Extensions) -> anyhow::Result<Selection<'a>> {
+fn selection(this: Override, extensions: &Extensions) -> anyhow::Result<Selection> {
     check_run(&this.run)?;
     let envs = this.envs.as_ref().map(|names| envs(names, extensions)).transpose()?;
     let envs = envs.map(|envs| envs.into_iter().map(|env| env.id().to_owned()).collect());
     let memories = this.memories.as_ref().map(|names| memories(names, extensions)).transpose()?;
-    Ok(Selection { envs, memories, run: &this.run })
+    Ok(Selection { envs, memories, run: this.run })
 }
 
 /// What makes a trial itself is said by its product.
@@ -159,31 +231,6 @@ fn check_run(run: &Table) -> anyhow::Result<()> {
         None | Some(Value::Table(_)) => Ok(()),
         Some(other) => bail!("memory is {other}, allowed is a table of options; names belong into a [[product]]"),
     }
-}
-
-/// The keys of one trial's configuration.
-fn given(run: &Table, selections: &[Selection<'_>], env: &Entry, memory: &str, seed: u64) -> Table {
-    let mut given = Table::from_iter([
-        ("threads".to_owned(), Value::Integer(1)),
-        ("device".to_owned(), Value::String("cpu".to_owned())),
-        ("service".to_owned(), Value::Table(Table::from_iter([("actors".to_owned(), Value::Integer(1))]))),
-    ]);
-    config::merge(&mut given, run);
-    for selection in selections {
-        let has = |list: &Option<Vec<String>>, name: &str| {
-            list.as_ref().is_none_or(|list| list.iter().any(|known| known == name))
-        };
-        if has(&selection.envs, env.id()) && has(&selection.memories, memory) {
-            config::merge(&mut given, selection.run);
-        }
-    }
-    let itself = Table::from_iter([
-        ("env".to_owned(), Value::String(env.id().to_owned())),
-        ("seed".to_owned(), Value::Integer(seed as i64)),
-        ("memory".to_owned(), Value::Table(Table::from_iter([("name".to_owned(), Value::String(memory.to_owned()))]))),
-    ]);
-    config::merge(&mut given, &itself);
-    given
 }
 
 /// The environments that `names` select, each once, in the order of the names: an id, a game (`RepeatFirst`: its
@@ -340,6 +387,11 @@ mod tests {
             ("[run]\nmemory = 'gru'\n".to_owned() + &good, &["[run]", "memory is \"gru\"", "[[product]]"]),
             ("[run]\nstep = 5\n".to_owned() + &good, &["RepeatFirstEasy", "unknown key `step`", "`steps`"]),
             ("[run]\nsteps = 0\n".to_owned() + &good, &["trial 0", "steps is 0"]),
+            (
+                product("['RepeatFirstEasy']", "['mlp']", "[0]")
+                    + &product("['all']", "['all']", &format!("{:?}", [0; 18])),
+                &["[[product]] 2", "10531 combinations", "10000"],
+            ),
         ] {
             let error = format!("{:#}", parse(&text, &Extensions::default()).expect_err(&text));
             for part in parts {
