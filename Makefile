@@ -8,11 +8,14 @@ CARGO ?= cargo
 CARGO_FLAGS ?= --locked
 # For the learner, on top of what `make train` gives it.
 ARGS ?=
+# Of make fuzz: which targets, and seconds for each.
+FUZZ_TARGETS ?= wire weights checkpoint configuration study recording
+SECONDS_EACH ?= 1800
 
 # Another libtorch of the user's would be compiled against but not found at run time.
 unexport LIBTORCH LIBTORCH_INCLUDE LIBTORCH_LIB LIBTORCH_STATIC LIBTORCH_USE_PYTORCH
 
-.PHONY: help setup build train test soak lint bench clean
+.PHONY: help setup build train test soak lint bench fuzz clean
 
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "make %-8s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -43,6 +46,17 @@ lint: setup ## formatting, clippy, and licences and advisories where cargo-deny 
 
 bench: setup ## all benchmarks
 	$(CARGO) bench $(CARGO_FLAGS) --workspace
+
+fuzz: setup ## fuzz what reads from outside, SECONDS_EACH=1800 for each target; needs cargo-fuzz
+	@$(CARGO) fuzz --version >/dev/null 2>&1 || { \
+		echo "cargo-fuzz is not installed: cargo install --locked cargo-fuzz" >&2; exit 1; }
+	for target in $(FUZZ_TARGETS); do \
+		mkdir -p ".cache/fuzz/$$target"; \
+		OMP_NUM_THREADS=1 LD_LIBRARY_PATH="$(CURDIR)/.libtorch/lib" \
+		$(CARGO) fuzz run --fuzz-dir tests/fuzz "$$target" --features libfuzzer -s none \
+			".cache/fuzz/$$target" "tests/fuzz/corpus/$$target" -- \
+			-max_total_time=$(SECONDS_EACH) -timeout=20 -rss_limit_mb=4096; \
+	done
 
 clean: ## remove what was built here; the cached libtorch stays
 	$(CARGO) clean
