@@ -1,6 +1,6 @@
 //! One connection to the learner: hello, welcome, ready; then epochs and leases in, episodes out.
 
-use std::time::{Duration, SystemTime, UNIX_EPOCH};
+use std::hash::{BuildHasher as _, RandomState};
 
 use popgym_proto::{ActorMessage, Hello, LearnerMessage, PROTOCOL_VERSION, RunSpec, limits, transport, wire};
 use tokio::sync::{mpsc, oneshot};
@@ -34,6 +34,7 @@ pub struct Identity {
     actor: String,
     run: Option<String>,
     slots: u32,
+    key: u64,
     incarnation: u64,
 }
 
@@ -46,18 +47,19 @@ impl Identity {
             let host: String = host.chars().filter(|c| !c.is_control()).take(100).collect();
             format!("{host}-{}", std::process::id())
         });
-        Self { actor, run: args.run.clone(), slots: args.slots, incarnation: 0 }
+        // SipHash under keys that the system drew.
+        let key = RandomState::new().hash_one("key");
+        Self { actor, run: args.run.clone(), slots: args.slots, key, incarnation: 0 }
     }
 
     /// The hello of the next connection.
     pub fn hello(&mut self) -> Hello {
-        // The wall clock, so that an actor of the same name that was started again is the newer one.
-        let now = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or(Duration::ZERO).as_micros() as u64;
-        self.incarnation = now.max(self.incarnation + 1);
+        self.incarnation += 1;
         Hello {
             protocol_version: PROTOCOL_VERSION,
             build: env!("CARGO_PKG_VERSION").to_owned(),
             actor: self.actor.clone(),
+            key: self.key,
             incarnation: self.incarnation,
             slots: self.slots,
             run: self.run.clone(),

@@ -2,6 +2,7 @@
 
 use bytes::Bytes;
 use popgym_envs::space::{Leaf, Space, Value};
+use prost::Message as _;
 
 use crate::error::within;
 use crate::{WireError, limits, wire};
@@ -66,9 +67,7 @@ impl EpisodeSpec {
     /// Episodes that are too long, or too large for one message.
     pub fn check(&self) -> Result<(), WireError> {
         within("max_steps", self.max_steps, 1..=limits::MAX_EPISODE_STEPS)?;
-        let row = |space: &Space| space.discrete_width() + size_of::<f32>() * space.real_width();
-        let step = row(&self.observation) + row(&self.action) + size_of::<f64>() + size_of::<f32>();
-        let largest = (self.max_steps as usize).saturating_add(1).saturating_mul(step);
+        let largest = self.largest_episode();
         let most = limits::MAX_MESSAGE_BYTES - limits::MESSAGE_OVERHEAD_BYTES;
         if largest > most {
             return Err(WireError::Length {
@@ -78,6 +77,19 @@ impl EpisodeSpec {
             });
         }
         Ok(())
+    }
+
+    /// Size of the columns of an episode of the greatest length, in bytes.
+    fn largest_episode(&self) -> usize {
+        let row = |space: &Space| space.discrete_width() + size_of::<f32>() * space.real_width();
+        let step = row(&self.observation) + row(&self.action) + size_of::<f64>() + size_of::<f32>();
+        (self.max_steps as usize).saturating_add(1).saturating_mul(step)
+    }
+
+    /// Size of the largest message with such episodes, in bytes.
+    pub fn largest_message(&self) -> usize {
+        let overhead = limits::MESSAGE_OVERHEAD_BYTES + limits::MAX_EPISODES * limits::EPISODE_OVERHEAD_BYTES;
+        (limits::EPISODES_MESSAGE_BYTES.max(self.largest_episode()) + overhead).min(limits::MAX_MESSAGE_BYTES)
     }
 }
 
@@ -154,14 +166,18 @@ impl EpisodeBatch {
             let allowed = format!("1..={} episodes", limits::MAX_EPISODES);
             return Err(WireError::Length { field: "episodes", length: wire.episodes.len(), allowed });
         }
+        let decode = |bytes: Bytes| {
+            let wire = wire::Episode::decode(bytes)
+                .map_err(|error| WireError::Encoding { field: "episode", problem: error.to_string() })?;
+            Episode::from_wire(wire, spec)
+        };
         let (epoch, version) = (wire.epoch, wire.version);
-        let episodes: Result<_, _> = wire.episodes.into_iter().map(|wire| Episode::from_wire(wire, spec)).collect();
-        Ok(Self { epoch, version, episodes: episodes? })
+        Ok(Self { epoch, version, episodes: wire.episodes.into_iter().map(decode).collect::<Result<_, _>>()? })
     }
 
     /// The batch as it travels.
     pub fn into_wire(self) -> wire::Episodes {
-        let episodes = self.episodes.into_iter().map(Episode::into_wire).collect();
+        let episodes = self.episodes.into_iter().map(|episode| episode.into_wire().encode_to_vec().into()).collect();
         wire::Episodes { epoch: self.epoch, version: self.version, episodes }
     }
 }

@@ -49,6 +49,14 @@ pub enum WireError {
         /// What the parser says.
         problem: String,
     },
+    /// Bytes that are not a message of protobuf.
+    #[error("{field} is no message: {problem}")]
+    Encoding {
+        /// The field.
+        field: &'static str,
+        /// What the decoder says.
+        problem: String,
+    },
     /// Weights that are not safetensors.
     #[error("{field} is not safetensors: {problem}")]
     Weights {
@@ -68,6 +76,7 @@ impl WireError {
             Self::Length { .. } => "length",
             Self::Element { .. } => "element",
             Self::Toml { .. } => "toml",
+            Self::Encoding { .. } => "encoding",
             Self::Weights { .. } => "weights",
         }
     }
@@ -85,15 +94,18 @@ where
     Err(WireError::Value { field, value: value.to_string(), allowed })
 }
 
-/// Checks a name: `min..=128` characters, none of them white space or control characters.
+/// Checks a name: `min..=128` characters, all of them visible wherever they are shown: no white space, nothing that controls a
+/// terminal or turns the direction of a line.
 pub(crate) fn name(field: &'static str, value: String, min: usize) -> Result<String, WireError> {
     let chars = value.chars().count();
     if !(min..=crate::limits::MAX_NAME_CHARS).contains(&chars) {
         let allowed = format!("{min}..={} characters", crate::limits::MAX_NAME_CHARS);
         return Err(WireError::Length { field, length: chars, allowed });
     }
-    if value.chars().any(|c| c.is_whitespace() || c.is_control()) {
-        let allowed = "a name without white space".to_owned();
+    // What Rust's own escapes leave as it is; quotation marks and backslashes they escape for other reasons.
+    let visible = |c: char| !c.is_whitespace() && (c.escape_debug().len() == 1 || matches!(c, '\'' | '"' | '\\'));
+    if !value.chars().all(visible) {
+        let allowed = "a name without white space and invisible characters".to_owned();
         return Err(WireError::Value { field, value: format!("`{}`", value.escape_debug()), allowed });
     }
     Ok(value)

@@ -5,7 +5,17 @@
 
 use std::time::Duration;
 
-/// Largest encoded message, both to send and to receive, in bytes.
+/// How often something may happen.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Rate {
+    /// So many times at once.
+    pub burst: u32,
+    /// So many times a second in the long run.
+    pub per_second: u32,
+}
+
+/// Largest encoded message, both to send and to receive, in bytes. A learner takes none that is larger than its run's
+/// episodes need ([`crate::EpisodeSpec::largest_message`]).
 ///
 /// Weights are 1 to 3 MB (GRU-256: 0.5 M parameters x 4 B = 2 MB); the largest memories reach some 20 MB. An episode of
 /// [`MAX_EPISODE_STEPS`] steps with 100 reals to see is 65,536 x (4 x 100 + 13) B = 27 MB.
@@ -13,6 +23,10 @@ pub const MAX_MESSAGE_BYTES: usize = 64 << 20;
 
 /// Room kept for what surrounds weights or an episode in its message, in bytes: tags, lengths, indices.
 pub const MESSAGE_OVERHEAD_BYTES: usize = 1024;
+
+/// What surrounds the columns of an episode in its message, in bytes, at most: ten tags of one byte, eight lengths of up to
+/// five, an index of up to ten.
+pub const EPISODE_OVERHEAD_BYTES: usize = 64;
 
 /// Episodes that end together travel together up to about this many bytes; then a further message starts.
 ///
@@ -55,8 +69,29 @@ pub const MAX_SESSIONS: usize = 1024;
 /// Most connections of one learner: all actors, and as many again that come and go or only ask for its health.
 pub const MAX_CONNECTIONS: usize = 2 * MAX_SESSIONS;
 
-/// Most connections from one address that have not said a legal hello. They are dropped after [`HELLO_DEADLINE`].
+/// Most connections from one address whose actor is not ready. They are dropped after [`HELLO_DEADLINE`], or after
+/// [`READY_DEADLINE`] where they have said a legal hello.
 pub const MAX_STRANGERS: usize = 256;
+
+/// Connections and requests of one address. An actor takes two to connect: all of [`MAX_SESSIONS`] may be behind one
+/// address, and come back twice in a few minutes.
+pub const ATTEMPTS: Rate = Rate { burst: 4 * MAX_SESSIONS as u32, per_second: 4 };
+
+/// What a session that broke a rule costs of its address's [`ATTEMPTS`]. No honest actor ever does, so this is for liars:
+/// 64 at once, then one in 16 s.
+pub const OFFENCE_ATTEMPTS: u32 = 64;
+
+/// Bytes that a connection may carry before its actor is ready: one list of headers ([`MAX_HEADER_LIST_BYTES`]), a hello of
+/// 2 KiB, and some to spare. Afterwards, as many beyond its longest message and [`WINDOW_BYTES`] that are under way.
+pub const STRANGER_BYTES: usize = 64 << 10;
+
+/// Heartbeats of a session. One is sent every [`HEARTBEAT_INTERVAL`]; a network that stood still for [`SILENCE_LIMIT`]
+/// delivers four at once.
+pub const HEARTBEATS: Rate = Rate { burst: 16, per_second: 1 };
+
+/// Bytes of HTTP/2 (pings, acknowledgements, windows) that a connection may carry for each message of its actor. Between two
+/// heartbeats there are some 100.
+pub const OVERHEAD_BYTES: usize = 16 << 10;
 
 /// A peer whose TLS handshake takes longer is dropped.
 pub const TLS_DEADLINE: Duration = Duration::from_secs(5);
@@ -75,6 +110,14 @@ pub const HEARTBEAT_INTERVAL: Duration = Duration::from_secs(5);
 
 /// A peer that sent nothing for this long is gone: four heartbeats.
 pub const SILENCE_LIMIT: Duration = Duration::from_secs(20);
+
+/// An actor that holds leases and has sent nothing for this long, and for [`LEASE_PATIENCE_FACTOR`] times as long as others of
+/// the epoch took for all of theirs, keeps idle actors waiting: they get its leases. Each time within an epoch, it takes twice
+/// as long. The longest episodes of the benchmark (1,024 steps, of some ms each when few are left) take seconds.
+pub const LEASE_PATIENCE: Duration = Duration::from_mins(5);
+
+/// See [`LEASE_PATIENCE`]. Slower machines than that are no help.
+pub const LEASE_PATIENCE_FACTOR: u32 = 4;
 
 /// HTTP/2 pings, both sides: every 10 s, also on an idle connection. Peers that do not answer within
 /// [`KEEPALIVE_TIMEOUT`] are gone. Together 20 s, as for heartbeats; the latter also notice a process that hangs.
@@ -98,7 +141,7 @@ pub const WINDOW_BYTES: u32 = 16 << 20;
 /// Most concurrent streams of a connection: a session, health checks, and some to spare.
 pub const MAX_STREAMS_PER_CONNECTION: u32 = 8;
 
-/// Most streams of a connection that were reset and not yet cleaned up ("rapid reset").
+/// Most streams of a connection that were reset and not yet cleaned up ("rapid reset"), by the peer or over its errors.
 pub const MAX_PENDING_RESET_STREAMS: usize = 16;
 
 /// Largest HTTP/2 header list, in bytes.

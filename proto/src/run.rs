@@ -119,9 +119,12 @@ pub struct Hello {
     pub protocol_version: u32,
     /// Version of the actor's package.
     pub build: String,
-    /// The actor's name, the same when it reconnects.
+    /// The actor's name, for people: the same when it reconnects. Two actors may have the same.
     pub actor: String,
-    /// Grows with each connection of the same actor.
+    /// Drawn at random by the actor's process, and shown to the learner alone. A connection replaces an older one of the same
+    /// name and key, so nobody can end another's.
+    pub key: u64,
+    /// Grows with each connection of the same process.
     pub incarnation: u64,
     /// Episodes that it can step at a time.
     pub slots: u32,
@@ -140,6 +143,7 @@ impl Hello {
             protocol_version: wire.protocol_version,
             build: name("build", wire.build, 0)?,
             actor: name("actor", wire.actor, 1)?,
+            key: wire.key,
             incarnation: wire.incarnation,
             slots: within("slots", wire.slots, 1..=limits::MAX_SLOTS)?,
             run: (!run.is_empty()).then_some(run),
@@ -152,6 +156,7 @@ impl Hello {
             protocol_version: self.protocol_version,
             build: self.build,
             actor: self.actor,
+            key: self.key,
             incarnation: self.incarnation,
             slots: self.slots,
             run: self.run.unwrap_or_default(),

@@ -60,6 +60,7 @@ pub fn server() -> Server {
         .initial_connection_window_size(limits::WINDOW_BYTES)
         .max_concurrent_streams(limits::MAX_STREAMS_PER_CONNECTION)
         .http2_max_pending_accept_reset_streams(Some(limits::MAX_PENDING_RESET_STREAMS))
+        .http2_max_local_error_reset_streams(Some(limits::MAX_PENDING_RESET_STREAMS))
         .http2_max_header_list_size(limits::MAX_HEADER_LIST_BYTES)
 }
 

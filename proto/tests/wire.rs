@@ -147,6 +147,62 @@ fn each_lie_is_named() {
 }
 
 #[test]
+fn what_is_no_episode_is_refused() {
+    let spec = mixed();
+    let refused = |episodes: Vec<Bytes>| {
+        let bytes = wire::Episodes { epoch: 0, version: 0, episodes }.encode_to_vec();
+        EpisodeBatch::from_wire(wire::Episodes::decode(&bytes[..]).unwrap(), &spec).unwrap_err()
+    };
+    // Two bytes each: counted before they are looked into.
+    assert_eq!(
+        refused(vec![Bytes::new(); 1 << 20]).to_string(),
+        "episodes has length 1048576, allowed is 1..=4096 episodes"
+    );
+    assert_eq!(refused(vec![Bytes::new()]).to_string(), "steps is 0, allowed is 1..=20");
+    let endless = refused(vec![Bytes::from_static(&[0x1a, 0xff, 0xff, 0xff, 0xff, 0x0f])]);
+    assert_eq!(endless.reason(), "encoding");
+    assert!(endless.to_string().starts_with("episode is no message: "), "{endless}");
+}
+
+#[test]
+fn the_largest_message_has_room_for_all_that_an_actor_sends() {
+    let one_step = |spec: &EpisodeSpec, index| Bytes::from(episode(spec, index, 1, 1).into_wire().encode_to_vec());
+    for spec in [mixed(), repeat_previous()] {
+        // All slots may end in one step, and all numbers be large.
+        let episodes = (0..limits::MAX_EPISODES as u64).map(|i| one_step(&spec, u64::MAX - i)).collect();
+        let batch = wire::Episodes { epoch: u64::MAX, version: u64::MAX, episodes };
+        let columns = limits::MAX_EPISODES * episode(&spec, 0, 1, 1).wire_bytes();
+        let message = wire::FromActor { message: Some(wire::from_actor::Message::Episodes(batch)) };
+        let overhead = message.encoded_len() - columns;
+        assert!(spec.largest_message() >= limits::EPISODES_MESSAGE_BYTES + overhead);
+    }
+    // One that is larger than messages are otherwise travels alone.
+    let large = EpisodeSpec { max_steps: 40_000, observation: Space::uniform_box(50, 0.0, 1.0), ..mixed() };
+    let alone = episode(&large, 0, 40_000, 1);
+    assert!(alone.wire_bytes() > limits::EPISODES_MESSAGE_BYTES);
+    let message =
+        ActorMessage::Episodes(EpisodeBatch { epoch: u64::MAX, version: u64::MAX, episodes: vec![alone] }).into_wire();
+    assert!(message.encoded_len() <= large.largest_message());
+}
+
+#[test]
+fn names_can_be_shown_anywhere() {
+    let spec = mixed();
+    let named = |actor: &str| {
+        let hello = wire::Hello { actor: actor.to_owned(), slots: 1, ..wire::Hello::default() };
+        ActorMessage::from_wire(wire::FromActor { message: Some(wire::from_actor::Message::Hello(hello)) }, &spec)
+    };
+    for name in ["a", "höst-1", "\u{4e2d}\u{6587}", "it's\"a\\b", &"x".repeat(128)] {
+        assert!(named(name).is_ok(), "{name}");
+    }
+    for name in ["", "a b", "a\nb", "\u{1b}[2J", "\u{202e}evil", "a\u{200b}", "\u{feff}", "\0", &"x".repeat(129)] {
+        let told = named(name).unwrap_err().to_string();
+        assert!(told.chars().all(|c| !c.is_control() && c != '\u{202e}'), "{told:?}");
+        assert!(told.len() < 200, "{told}");
+    }
+}
+
+#[test]
 fn the_builder_gives_what_was_pushed() {
     let spec = mixed();
     let expected = episode(&spec, 9, 6, 4);
@@ -246,6 +302,7 @@ fn the_other_messages_survive_the_wire() {
         protocol_version: PROTOCOL_VERSION,
         build: "0.1.0".to_owned(),
         actor: "a-1".to_owned(),
+        key: u64::MAX - 1,
         incarnation: 4,
         slots: 128,
         run: None,

@@ -4,10 +4,10 @@
 //! those of a session that ends are leased again, lowest number first. The batch is the shortest prefix that reaches the
 //! target, so it does not depend on who sampled what, or when.
 
-use std::collections::{BTreeMap, BTreeSet, HashMap};
+use std::collections::{BTreeMap, BTreeSet, HashMap, HashSet};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 use popgym_proto::{Episode, EpisodeBatch, Hello, Leases, OpenEpoch, WeightSet, limits};
 use tokio::sync::{mpsc, oneshot};
@@ -62,12 +62,17 @@ pub(super) struct Shared {
 const MAX_KNOWN_ACTORS: usize = 65_536;
 
 struct Session {
+    /// Its actor's name, or, where another session has that, one like it.
     actor: String,
-    slots: u32,
+    hello: Hello,
     orders: mpsc::Sender<Order>,
     /// Version of the weights that were sent to it.
     version: Option<u64>,
     held: BTreeSet<u64>,
+    /// Since when its leases wait: it got the first, or sent an episode.
+    waiting: Instant,
+    /// The epoch that it last sent an episode of.
+    worked: Option<u64>,
 }
 
 struct Epoch {
@@ -75,6 +80,10 @@ struct Epoch {
     weights: WeightSet,
     target: Target,
     opened: Instant,
+    /// When the last of its episodes came.
+    progressed: Instant,
+    /// How long leases may wait while others have nothing to do.
+    patience: Duration,
     /// The lowest number that was never leased.
     next: u64,
     /// Numbers that were leased, and lost.
@@ -90,8 +99,8 @@ struct Epoch {
 
 pub(super) struct Coordinator {
     sessions: BTreeMap<u64, Session>,
-    /// Actor -> its newest incarnation.
-    known: HashMap<String, u64>,
+    /// Names that have been here.
+    known: HashSet<String>,
     /// `None`: nothing to sample at the moment.
     epoch: Option<Epoch>,
     length: LengthEstimate,
@@ -110,7 +119,7 @@ impl Coordinator {
     ) -> Self {
         Self {
             sessions: BTreeMap::new(),
-            known: HashMap::new(),
+            known: HashSet::new(),
             epoch: None,
             length: LengthEstimate::unknown(max_steps),
             results,
@@ -123,8 +132,17 @@ impl Coordinator {
     /// Handles events until all who could send one have gone.
     pub(super) async fn run(mut self, mut events: mpsc::Receiver<Event>) {
         let mut pending = Vec::with_capacity(limits::COORDINATOR_QUEUE);
-        // All that has arrived is handled before leases are planned: one plan, not one for each message.
-        while events.recv_many(&mut pending, limits::COORDINATOR_QUEUE).await > 0 {
+        let mut clock = tokio::time::interval(limits::HEARTBEAT_INTERVAL);
+        loop {
+            // All that has arrived is handled before leases are planned: one plan, not one for each message.
+            tokio::select! {
+                received = events.recv_many(&mut pending, limits::COORDINATOR_QUEUE) => {
+                    if received == 0 {
+                        return;
+                    }
+                }
+                _ = clock.tick() => self.take_overdue(Instant::now()),
+            }
             let queued = events.len() + pending.len();
             for event in pending.drain(..) {
                 self.handle(event);
@@ -146,7 +164,7 @@ impl Coordinator {
     fn handle(&mut self, event: Event) {
         match event {
             Event::Joined { session, hello, orders, reply } => {
-                let answer = self.join(session, &hello, orders);
+                let answer = self.join(session, hello, orders);
                 let accepted = answer.is_ok();
                 if reply.send(answer).is_err() && accepted {
                     self.leave(session, "closed its connection");
@@ -168,31 +186,37 @@ impl Coordinator {
         }
     }
 
-    fn join(&mut self, session: u64, hello: &Hello, orders: mpsc::Sender<Order>) -> Result<(), Status> {
-        let known = self.known.get(&hello.actor).copied();
-        if known.is_some_and(|newest| hello.incarnation <= newest) {
-            return Err(Status::failed_precondition(format!(
-                "another actor named {} has connected since; give each its own --name",
-                hello.actor
-            )));
-        }
-        let older = self.sessions.iter().find(|(_, session)| session.actor == hello.actor).map(|(&id, _)| id);
-        if let Some(older) = older {
-            let superseded = "another actor of this name has connected; give each its own --name";
-            self.order(older, Order::End(Status::failed_precondition(superseded)));
+    fn join(&mut self, session: u64, hello: Hello, orders: mpsc::Sender<Order>) -> Result<(), Status> {
+        let own = |older: &Hello| older.actor == hello.actor && older.key == hello.key;
+        let older = self.sessions.iter().find(|(_, session)| own(&session.hello));
+        if let Some((&older, Session { hello: Hello { incarnation, .. }, .. })) = older {
+            if hello.incarnation <= *incarnation {
+                return Err(Status::failed_precondition("this actor has connected anew since"));
+            }
+            self.order(older, Order::End(Status::failed_precondition("this actor has connected anew")));
             self.leave(older, "connected anew");
         }
-        if known.is_some() || self.known.len() < MAX_KNOWN_ACTORS {
-            self.known.insert(hello.actor.clone(), hello.incarnation);
+        let returned = self.known.contains(&hello.actor);
+        if self.known.len() < MAX_KNOWN_ACTORS {
+            self.known.insert(hello.actor.clone());
         }
-        let (actor, slots) = (hello.actor.clone(), hello.slots);
-        let what = if known.is_some() { "actor returned" } else { "actor joined" };
-        info!(actor, slots, actors = self.sessions.len() + 1, "{what}");
-        metrics::joined(known.is_some());
-        self.account.write(Entry::Joined { actor: &actor, returned: known.is_some() });
-        self.sessions.insert(session, Session { actor, slots, orders, version: None, held: BTreeSet::new() });
+        let actor = self.free_name(&hello.actor);
+        let what = if returned { "actor returned" } else { "actor joined" };
+        info!(actor, slots = hello.slots, actors = self.sessions.len() + 1, "{what}");
+        metrics::joined(returned);
+        self.account.write(Entry::Joined { actor: &actor, returned });
+        let (held, waiting) = (BTreeSet::new(), Instant::now());
+        self.sessions.insert(session, Session { actor, hello, orders, version: None, held, waiting, worked: None });
         self.count_actors();
         Ok(())
+    }
+
+    /// `name`, or with a number behind it where someone here has that name: in log and account, no two have the same.
+    fn free_name(&self, name: &str) -> String {
+        let taken: HashSet<&str> = self.sessions.values().map(|session| session.actor.as_str()).collect();
+        let numbered = (2..).map(|number: u64| format!("{name}#{number}"));
+        let mut names = std::iter::once(name.to_owned()).chain(numbered);
+        names.find(|name| !taken.contains(name.as_str())).unwrap_or_default()
     }
 
     /// Tells a newcomer how things stand.
@@ -266,6 +290,8 @@ impl Coordinator {
             weights,
             target,
             opened: Instant::now(),
+            progressed: Instant::now(),
+            patience: limits::LEASE_PATIENCE,
             next: 0,
             lost: BTreeSet::new(),
             holders: HashMap::new(),
@@ -308,6 +334,8 @@ impl Coordinator {
             }
         }
         if !accepted.is_empty() {
+            let now = Instant::now();
+            (session.waiting, session.worked, epoch.progressed) = (now, Some(number), now);
             let episodes = ranges(accepted);
             self.account.write(Entry::Accepted { epoch: number, version, actor, episodes });
         }
@@ -339,6 +367,29 @@ impl Coordinator {
         let _ = self.results.send(collected);
     }
 
+    /// Takes the leases of those who do nothing about them, where others who work wait for that and nothing else.
+    fn take_overdue(&mut self, now: Instant) {
+        let Some(epoch) = &mut self.epoch else { return };
+        let waits = |session: &Session| session.held.is_empty() && session.worked == Some(epoch.number);
+        if !self.sessions.values().any(waits) {
+            return;
+        }
+        let usual = epoch.progressed - epoch.opened;
+        let patience = epoch.patience.max(limits::LEASE_PATIENCE_FACTOR * usual);
+        let is_overdue =
+            |session: &Session| !session.held.is_empty() && now.saturating_duration_since(session.waiting) > patience;
+        let overdue: Vec<u64> =
+            self.sessions.iter().filter(|(_, session)| is_overdue(session)).map(|(&id, _)| id).collect();
+        if !overdue.is_empty() {
+            // It may be the episode that takes so long, whoever samples it.
+            epoch.patience *= 2;
+        }
+        for id in overdue {
+            self.order(id, Order::Overdue);
+            self.leave(id, "its leases are overdue");
+        }
+    }
+
     /// Leases what the batch still needs to whoever has room.
     fn lease(&mut self) {
         let Some(epoch) = &mut self.epoch else { return };
@@ -348,7 +399,8 @@ impl Coordinator {
         if count == 0 {
             return;
         }
-        let seats = self.sessions.iter().map(|(&session, s)| Seat { session, slots: s.slots, held: s.held.len() });
+        let seats =
+            self.sessions.iter().map(|(&session, s)| Seat { session, slots: s.hello.slots, held: s.held.len() });
         let mut leases: BTreeMap<u64, Vec<u64>> = BTreeMap::new();
         for session in assign(count, seats) {
             let index = epoch.lost.pop_first().unwrap_or_else(|| {
@@ -362,6 +414,9 @@ impl Coordinator {
         let sessions = self.sessions.len();
         for (id, episodes) in leases {
             if let Some(session) = self.sessions.get_mut(&id) {
+                if session.held.is_empty() {
+                    session.waiting = Instant::now();
+                }
                 session.held.extend(&episodes);
                 let episodes = ranges(episodes.iter().copied());
                 self.account.write(Entry::Leased { epoch: number, actor: &session.actor, episodes });
@@ -413,3 +468,6 @@ impl Epoch {
         }
     }
 }
+
+#[cfg(test)]
+mod tests;

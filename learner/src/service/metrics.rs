@@ -8,7 +8,8 @@ pub(super) fn describe() {
     describe_gauge!("popgym_learner_connections", "TCP connections, of actors and others");
     describe_counter!(
         "popgym_learner_connections_refused_total",
-        "Connections refused, by reason: full, tls, token, deadline (no hello in time)"
+        "Connections and requests refused, by reason: full, rate (too often), tls, http2 (another protocol), token, \
+         deadline (no hello in time), flood (bytes without use)"
     );
     describe_counter!(
         "popgym_learner_account_failures_total",
@@ -19,12 +20,17 @@ pub(super) fn describe() {
     describe_gauge!("popgym_learner_lag_epochs", "Open epoch minus the version that samples it");
     describe_counter!("popgym_learner_sessions_total", "Sessions that got as far as being ready");
     describe_counter!("popgym_learner_reconnects_total", "Sessions of actors that had been here before");
-    describe_counter!("popgym_learner_handshakes_refused_total", "Actors that were refused");
+    describe_counter!(
+        "popgym_learner_sessions_refused_total",
+        "Sessions refused or ended, by reason: full, second (of one connection), handshake, silent, unread, \
+         overdue (leases), illegal, heartbeats (too many), excess (more episodes than leases)"
+    );
     describe_counter!("popgym_learner_leases_lost_total", "Leases of actors that went away; they are leased again");
     describe_counter!("popgym_learner_episodes_accepted_total", "Episodes received and wanted");
     describe_counter!(
         "popgym_learner_episodes_refused_total",
-        "Episodes received and dropped, by reason: illegal (what is illegal), late, unleased, version"
+        "Episodes received and dropped, by reason: late, unleased, version, excess; and messages by what was illegal: \
+         missing, value, length, element, encoding"
     );
     describe_counter!("popgym_learner_received_bytes_total", "Bytes of the columns of episodes received");
     describe_counter!("popgym_learner_sent_bytes_total", "Bytes of weights sent");
@@ -61,8 +67,8 @@ pub(super) fn joined(returned: bool) {
     }
 }
 
-pub(super) fn handshake_refused() {
-    counter!("popgym_learner_handshakes_refused_total").increment(1);
+pub(super) fn session_refused(reason: &'static str) {
+    counter!("popgym_learner_sessions_refused_total", "reason" => reason).increment(1);
 }
 
 pub(super) fn leases_lost(count: usize) {

@@ -2,7 +2,8 @@
 //!
 //! | module | what it holds |
 //! |---|---|
-//! | `connections` | who may connect, how many, and how long without a word |
+//! | `connections` | who may connect, how many, how long without a word, and how much to no use |
+//! | `allowance` | how often something may happen |
 //! | `account` | what happened, in `events.jsonl` |
 //! | `tls` | the learner's certificate, and its actors' |
 //! | `session` | one actor: handshake, checks, deadlines |
@@ -28,10 +29,11 @@ use popgym_proto::{Episode, EpisodeSpec, Fingerprint, RunSpec, Token, WeightSet,
 use tokio::sync::{Semaphore, mpsc, oneshot};
 use tokio_stream::Stream;
 use tokio_stream::wrappers::ReceiverStream;
-use tonic::service::interceptor::InterceptedService;
+use tonic::service::interceptor::{InterceptedService, InterceptorLayer};
 use tonic::{Request, Response, Status, Streaming};
 
 mod account;
+mod allowance;
 mod connections;
 mod coordinator;
 mod metrics;
@@ -130,6 +132,7 @@ impl Service {
         account.write(Entry::Started { run: &spec.run, build: env!("CARGO_PKG_VERSION"), lag: spec.lag });
         let coordinator = Coordinator::new(spec.max_episode_steps, results_in, shared.clone(), account);
         runtime.spawn(coordinator.run(inbox));
+        let largest = episodes.largest_message();
         let endpoint = Endpoint {
             terms: Arc::new(Terms { spec, episodes, fingerprint }),
             events: events.clone(),
@@ -137,7 +140,7 @@ impl Service {
             sessions: AtomicU64::new(0),
         };
         let (accepted, connections) = mpsc::channel(limits::STREAM_QUEUE);
-        let gate = Arc::new(Gate::default());
+        let gate = Arc::new(Gate::new());
         for Entrance { listener, tls } in entrances {
             let tls = tls.map(TlsFiles::load).transpose()?;
             listener.set_nonblocking(true)?;
@@ -149,8 +152,10 @@ impl Service {
             let (health, health_service) = tonic_health::server::health_reporter();
             health.set_service_status(wire::learner_server::SERVICE_NAME, tonic_health::ServingStatus::Serving).await;
             let authorise = move |request| authorise(token.as_deref(), request);
-            let service = InterceptedService::new(transport::service(endpoint), authorise);
-            let server = transport::server().add_service(health_service).add_service(service);
+            let service = transport::service(endpoint).max_decoding_message_size(largest);
+            let service = InterceptedService::new(service, authorise);
+            let mut server = transport::server().layer(InterceptorLayer::new(count));
+            let server = server.add_service(health_service).add_service(service);
             let connections = ReceiverStream::new(connections);
             if let Err(error) = server.serve_with_incoming_shutdown(connections, async { drop(closed.await) }).await {
                 tracing::error!("the service for actors has ended: {error}");
@@ -230,6 +235,13 @@ fn load_token(file: PathBuf) -> anyhow::Result<Arc<Reloaded<Token>>> {
     Ok(Arc::new(token))
 }
 
+/// Refuses the requests of one who asks too often, whatever for.
+#[allow(clippy::result_large_err)] // tonic's own.
+fn count(request: Request<()>) -> Result<Request<()>, Status> {
+    peer(&request)?.attempt()?;
+    Ok(request)
+}
+
 /// Refuses a request without the token, before anything of it is read.
 #[allow(clippy::result_large_err)] // tonic's own.
 fn authorise(token: Option<&Reloaded<Token>>, request: Request<()>) -> Result<Request<()>, Status> {
@@ -266,10 +278,16 @@ impl wire::learner_server::Learner for Endpoint {
         let peer = peer(&request)?;
         let Ok(permit) = self.permits.clone().try_acquire_owned() else {
             let full = format!("this learner has {} actors, which is the most it takes", limits::MAX_SESSIONS);
+            peer.refuse_session("full", &full);
             return Err(Status::resource_exhausted(full));
         };
+        if !peer.occupy() {
+            let second = "this connection has a session already";
+            peer.refuse_session("second", second);
+            return Err(Status::failed_precondition(second));
+        }
         let id = self.sessions.fetch_add(1, Ordering::Relaxed);
-        let (replies, stream) = mpsc::channel(limits::STREAM_QUEUE);
+        let (replies, stream) = mpsc::channel(limits::STREAM_QUEUE + 1);
         let (terms, events) = (self.terms.clone(), self.events.clone());
         tokio::spawn(async move {
             session::serve(id, &terms, request.into_inner(), &peer, replies, events).await;

@@ -1,15 +1,18 @@
 //! One actor's session: handshake, then messages both ways, each with a deadline.
 
-use std::time::Duration;
+use std::error::Error as _;
+use std::sync::atomic::{AtomicU64, Ordering};
 
 use popgym_proto::{
-    ActorMessage, EpisodeSpec, Fingerprint, Hello, LearnerMessage, Leases, OpenEpoch, PROTOCOL_VERSION, RunSpec,
-    limits, wire,
+    ActorMessage, EpisodeBatch, EpisodeSpec, Fingerprint, Hello, LearnerMessage, Leases, OpenEpoch, PROTOCOL_VERSION,
+    RunSpec, limits, wire,
 };
+use prost::Message as _;
 use tokio::sync::{mpsc, oneshot};
-use tokio::time::{MissedTickBehavior, interval, timeout};
-use tonic::{Status, Streaming};
+use tokio::time::{Instant, MissedTickBehavior, interval, timeout};
+use tonic::{Code, Status, Streaming};
 
+use super::allowance::Bucket;
 use super::connections::Peer;
 use super::coordinator::Event;
 use super::metrics;
@@ -31,6 +34,8 @@ pub(super) enum Order {
     Lease(Leases),
     /// The epoch is complete.
     Close { epoch: u64 },
+    /// It has kept others waiting for too long: end the session.
+    Overdue,
     /// The run is complete.
     Stop { reason: String },
     /// End the session.
@@ -40,87 +45,149 @@ pub(super) enum Order {
 /// The stream to an actor.
 pub(super) type Replies = mpsc::Sender<Result<wire::FromLearner, Status>>;
 
+/// What can be held against an actor.
+#[derive(Clone, Copy, Debug)]
+enum Fault {
+    /// It is not an actor for this run.
+    Handshake,
+    /// It said nothing for too long.
+    Silent,
+    /// It does not read what it is told.
+    Unread,
+    /// It does not do what it took on.
+    Overdue,
+    /// It sent what is no message.
+    Illegal,
+    /// It sent more heartbeats than anyone needs.
+    Heartbeats,
+    /// It sent more episodes than it was ever leased.
+    Excess,
+}
+
+impl Fault {
+    /// The label in the metrics.
+    fn label(self) -> &'static str {
+        match self {
+            Self::Handshake => "handshake",
+            Self::Silent => "silent",
+            Self::Unread => "unread",
+            Self::Overdue => "overdue",
+            Self::Illegal => "illegal",
+            Self::Heartbeats => "heartbeats",
+            Self::Excess => "excess",
+        }
+    }
+
+    /// Whether nobody does this by mistake.
+    fn is_a_lie(self) -> bool {
+        matches!(self, Self::Illegal | Self::Heartbeats | Self::Excess)
+    }
+}
+
+/// How a session ends: what the actor is told, and what is held against it.
+#[derive(Debug)]
+struct End {
+    status: Status,
+    fault: Option<Fault>,
+}
+
+impl End {
+    fn because(fault: Fault, status: Status) -> Self {
+        Self { status, fault: Some(fault) }
+    }
+}
+
+impl From<Status> for End {
+    fn from(status: Status) -> Self {
+        Self { status, fault: None }
+    }
+}
+
 /// Serves one stream from its first message to its end, whatever that is.
 pub(super) async fn serve(
     id: u64,
     terms: &Terms,
-    mut requests: Streaming<wire::FromActor>,
+    requests: Streaming<wire::FromActor>,
     peer: &Peer,
     replies: Replies,
     events: mpsc::Sender<Event>,
 ) {
-    let hello = match handshake(terms, &mut requests, peer, &replies).await {
-        Ok(hello) => hello,
-        Err(status) => {
-            metrics::handshake_refused();
-            tracing::debug!(%status, "handshake refused");
-            return refuse(&replies, status).await;
+    // Room for the last word, which is said whether what came before is read or not.
+    let Ok(last) = replies.clone().try_reserve_owned() else { return };
+    let heartbeats = Bucket::new(limits::HEARTBEATS, Instant::now());
+    let mut requests = Requests { terms, peer, stream: requests, heartbeats };
+    let end = attend(id, &mut requests, &replies, &events).await;
+    if let Some(fault) = end.fault {
+        if fault.is_a_lie() {
+            peer.fine();
         }
+        peer.refuse_session(fault.label(), end.status.message());
+    }
+    last.send(Err(end.status));
+}
+
+/// All of a session but its last word.
+async fn attend(id: u64, requests: &mut Requests<'_>, replies: &Replies, events: &mpsc::Sender<Event>) -> End {
+    let ending = || Status::unavailable("the learner is ending").into();
+    let hello = match handshake(requests, replies).await {
+        Ok(hello) => hello,
+        Err(end) => return end,
     };
     let (to_session, orders) = mpsc::channel(limits::SESSION_QUEUE);
     let (reply, accepted) = oneshot::channel();
     if events.send(Event::Joined { session: id, hello, orders: to_session, reply }).await.is_err() {
-        return refuse(&replies, Status::unavailable("the learner is ending")).await;
+        return ending();
     }
     match accepted.await {
-        Ok(Ok(())) => {}
-        Ok(Err(status)) => {
-            metrics::handshake_refused();
-            return refuse(&replies, status).await;
-        }
-        Err(_) => return refuse(&replies, Status::unavailable("the learner is ending")).await,
+        Ok(Ok(())) => requests.peer.welcome(requests.terms.episodes.largest_message()),
+        Ok(Err(status)) => return End::because(Fault::Handshake, status),
+        Err(_) => return ending(),
     }
-    let status = tokio::select! {
-        status = listen(id, terms, &mut requests, &events) => status,
-        status = speak(orders, &replies) => status,
+    let leased = AtomicU64::new(0);
+    let end = tokio::select! {
+        end = listen(id, requests, &leased, events) => end,
+        end = speak(orders, replies, &leased) => end,
     };
-    let reason = status.message().to_owned();
-    refuse(&replies, status).await;
     // Fails only when the coordinator has ended, which then does not care.
-    let _ = events.send(Event::Left { session: id, reason }).await;
-}
-
-/// Ends the stream with `status`. Waits a moment where the actor has not read what came before.
-async fn refuse(replies: &Replies, status: Status) {
-    let _ = timeout(Duration::from_secs(1), replies.send(Err(status))).await;
+    let _ = events.send(Event::Left { session: id, reason: end.status.message().to_owned() }).await;
+    end
 }
 
 /// Hello, welcome, ready.
-async fn handshake(
-    terms: &Terms,
-    requests: &mut Streaming<wire::FromActor>,
-    peer: &Peer,
-    replies: &Replies,
-) -> Result<Hello, Status> {
-    let hello = match timeout(limits::HELLO_DEADLINE, next(terms, requests)).await {
+async fn handshake(requests: &mut Requests<'_>, replies: &Replies) -> Result<Hello, End> {
+    let terms = requests.terms;
+    let refused = |status| End::because(Fault::Handshake, status);
+    let hello = match timeout(limits::HELLO_DEADLINE, requests.next()).await {
         Ok(Ok(ActorMessage::Hello(hello))) => hello,
-        Ok(Ok(_)) => return Err(Status::invalid_argument("the first message must be a hello")),
-        Ok(Err(status)) => return Err(status),
-        Err(_) => return Err(Status::deadline_exceeded("no hello")),
+        Ok(Ok(_)) => return Err(refused(Status::invalid_argument("the first message must be a hello"))),
+        Ok(Err(end)) => return Err(end),
+        Err(_) => return Err(refused(Status::deadline_exceeded("no hello"))),
     };
-    check_hello(terms, &hello)?;
-    peer.welcome();
+    check_hello(terms, &hello).map_err(refused)?;
+    requests.peer.greet();
     send(replies, LearnerMessage::Welcome(terms.spec.clone())).await?;
     let ready = async {
         loop {
-            match next(terms, requests).await? {
+            match requests.next().await? {
                 ActorMessage::Ready(fingerprint) => return Ok(fingerprint),
                 ActorMessage::Heartbeat => {}
-                _ => return Err(Status::invalid_argument("expected ready after the welcome")),
+                _ => return Err(refused(Status::invalid_argument("expected ready after the welcome"))),
             }
         }
     };
-    let fingerprint =
-        timeout(limits::READY_DEADLINE, ready).await.map_err(|_| Status::deadline_exceeded("never ready"))??;
+    let fingerprint = match timeout(limits::READY_DEADLINE, ready).await {
+        Ok(fingerprint) => fingerprint?,
+        Err(_) => return Err(refused(Status::deadline_exceeded("never ready"))),
+    };
     if fingerprint != terms.fingerprint {
-        return Err(Status::failed_precondition(format!(
+        return Err(refused(Status::failed_precondition(format!(
             "the actor (build {}) builds another environment or policy for {} with {} than the learner (build {}); \
              use the same version of both",
             hello.build,
             terms.spec.env,
             terms.spec.memory,
             env!("CARGO_PKG_VERSION")
-        )));
+        ))));
     }
     Ok(hello)
 }
@@ -143,45 +210,57 @@ fn check_hello(terms: &Terms, hello: &Hello) -> Result<(), Status> {
     }
 }
 
-/// Passes on what the actor says, until it breaks a rule, falls silent, or goes away.
-async fn listen(
-    id: u64,
-    terms: &Terms,
-    requests: &mut Streaming<wire::FromActor>,
-    events: &mpsc::Sender<Event>,
-) -> Status {
+/// Passes on what the actor says, until it breaks a rule, falls silent, or goes away. `leased`: leases that it was told of.
+async fn listen(id: u64, requests: &mut Requests<'_>, leased: &AtomicU64, events: &mpsc::Sender<Event>) -> End {
+    let mut sent = 0;
     loop {
-        let message = match timeout(limits::SILENCE_LIMIT, next(terms, requests)).await {
+        let message = match timeout(limits::SILENCE_LIMIT, requests.next()).await {
             Ok(Ok(message)) => message,
-            Ok(Err(status)) => return status,
+            Ok(Err(end)) => return end,
             Err(_) => {
-                return Status::deadline_exceeded(format!("silent for {} s", limits::SILENCE_LIMIT.as_secs()));
+                let silent = format!("silent for {} s", limits::SILENCE_LIMIT.as_secs());
+                return End::because(Fault::Silent, Status::deadline_exceeded(silent));
             }
         };
         let batch = match message {
             ActorMessage::Episodes(batch) => batch,
             ActorMessage::Heartbeat => continue,
             ActorMessage::Hello(_) | ActorMessage::Ready(_) => {
-                return Status::invalid_argument("a second handshake in one session");
+                let again = Status::invalid_argument("a second handshake in one session");
+                return End::because(Fault::Illegal, again);
             }
         };
+        sent += batch.episodes.len() as u64;
+        if let Err(end) = check_count(&batch, sent, leased.load(Ordering::Relaxed)) {
+            return end;
+        }
         metrics::received(batch.episodes.iter().map(popgym_proto::Episode::wire_bytes).sum());
         if events.send(Event::Episodes { session: id, batch }).await.is_err() {
-            return Status::unavailable("the learner is ending");
+            return Status::unavailable("the learner is ending").into();
         }
     }
 }
 
+/// Every episode answers a lease, in time or late, so an actor never sends more of them: `sent`, with this batch.
+fn check_count(batch: &EpisodeBatch, sent: u64, leased: u64) -> Result<(), End> {
+    if sent <= leased {
+        return Ok(());
+    }
+    metrics::refused("excess", batch.episodes.len());
+    let excess = format!("{sent} episodes in a session that was leased {leased}");
+    Err(End::because(Fault::Excess, Status::invalid_argument(excess)))
+}
+
 /// Sends what the coordinator orders, and heartbeats while there is nothing to say.
-async fn speak(mut orders: mpsc::Receiver<Order>, replies: &Replies) -> Status {
+async fn speak(mut orders: mpsc::Receiver<Order>, replies: &Replies, leased: &AtomicU64) -> End {
     let mut heartbeat = interval(limits::HEARTBEAT_INTERVAL);
     heartbeat.set_missed_tick_behavior(MissedTickBehavior::Delay);
     loop {
         let order = tokio::select! {
             order = orders.recv() => order,
             _ = heartbeat.tick() => {
-                if let Err(status) = send(replies, LearnerMessage::Heartbeat).await {
-                    return status;
+                if let Err(end) = send(replies, LearnerMessage::Heartbeat).await {
+                    return end;
                 }
                 continue;
             }
@@ -191,40 +270,80 @@ async fn speak(mut orders: mpsc::Receiver<Order>, replies: &Replies) -> Status {
                 metrics::sent(epoch.weights.as_ref().map_or(0, |weights| weights.bytes.len()));
                 LearnerMessage::Epoch(epoch)
             }
-            Some(Order::Lease(leases)) => LearnerMessage::Leases(leases),
+            Some(Order::Lease(leases)) => {
+                leased.fetch_add(leases.episodes.len() as u64, Ordering::Relaxed);
+                LearnerMessage::Leases(leases)
+            }
             Some(Order::Close { epoch }) => LearnerMessage::Closed { epoch },
             Some(Order::Stop { reason }) => LearnerMessage::Stop { reason },
-            Some(Order::End(status)) => return status,
+            Some(Order::Overdue) => {
+                let overdue = Status::deadline_exceeded("its leases are overdue, and go to others");
+                return End::because(Fault::Overdue, overdue);
+            }
+            Some(Order::End(status)) => return status.into(),
             // Only a coordinator that drops a session for leaving its orders unread lets go without a word.
-            None => return Status::resource_exhausted("too slow: its messages were not read"),
+            None => return unread(),
         };
-        if let Err(status) = send(replies, message).await {
-            return status;
+        if let Err(end) = send(replies, message).await {
+            return end;
         }
     }
 }
 
-async fn send(replies: &Replies, message: LearnerMessage) -> Result<(), Status> {
-    replies.send(Ok(message.into_wire())).await.map_err(|_| Status::cancelled("the connection is gone"))
-}
-
-/// The actor's next message, checked.
-async fn next(terms: &Terms, requests: &mut Streaming<wire::FromActor>) -> Result<ActorMessage, Status> {
-    let message = match requests.message().await {
-        Ok(Some(message)) => message,
-        Ok(None) => return Err(Status::cancelled("closed its connection")),
-        Err(status) => return Err(Status::new(status.code(), describe(&status))),
-    };
-    ActorMessage::from_wire(message, &terms.episodes).map_err(|error| {
-        metrics::refused(error.reason(), 1);
-        Status::invalid_argument(format!("an illegal message: {error}"))
-    })
-}
-
-fn describe(status: &Status) -> String {
-    let mut cause: &dyn std::error::Error = status;
-    while let Some(next) = cause.source() {
-        cause = next;
+/// Sends a message. One that is not taken for [`limits::SILENCE_LIMIT`] comes too late: to the actor, this learner has gone.
+async fn send(replies: &Replies, message: LearnerMessage) -> Result<(), End> {
+    match timeout(limits::SILENCE_LIMIT, replies.send(Ok(message.into_wire()))).await {
+        Ok(sent) => sent.map_err(|_| Status::cancelled("the connection is gone").into()),
+        Err(_) => Err(unread()),
     }
-    if status.message().is_empty() { cause.to_string() } else { status.message().to_owned() }
+}
+
+fn unread() -> End {
+    End::because(Fault::Unread, Status::resource_exhausted("too slow: its messages were not read"))
+}
+
+/// What comes from an actor.
+struct Requests<'a> {
+    terms: &'a Terms,
+    peer: &'a Peer,
+    stream: Streaming<wire::FromActor>,
+    heartbeats: Bucket,
+}
+
+impl Requests<'_> {
+    /// The actor's next message, checked.
+    async fn next(&mut self) -> Result<ActorMessage, End> {
+        let message = match self.stream.message().await {
+            Ok(Some(message)) => message,
+            Ok(None) => return Err(Status::cancelled("closed its connection").into()),
+            Err(status) => return Err(unreadable(&status)),
+        };
+        let bytes = message.encoded_len();
+        let message = ActorMessage::from_wire(message, &self.terms.episodes).map_err(|error| {
+            metrics::refused(error.reason(), 1);
+            End::because(Fault::Illegal, Status::invalid_argument(format!("an illegal message: {error}")))
+        })?;
+        if message == ActorMessage::Heartbeat && !self.heartbeats.take(Instant::now()) {
+            return Err(End::because(Fault::Heartbeats, Status::resource_exhausted("too many heartbeats")));
+        }
+        self.peer.earn(bytes);
+        Ok(message)
+    }
+}
+
+/// A message that gRPC could not read: the actor's doing, or its connection's.
+fn unreadable(status: &Status) -> End {
+    let mut cause = status.source();
+    while let Some(next) = cause.and_then(std::error::Error::source) {
+        cause = Some(next);
+    }
+    match cause {
+        Some(cause) if status.message().is_empty() => Status::new(status.code(), cause.to_string()).into(),
+        Some(_) => Status::new(status.code(), status.message()).into(),
+        None => {
+            let code = if status.code() == Code::OutOfRange { Code::OutOfRange } else { Code::InvalidArgument };
+            metrics::refused("encoding", 1);
+            End::because(Fault::Illegal, Status::new(code, format!("an illegal message: {}", status.message())))
+        }
+    }
 }

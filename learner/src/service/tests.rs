@@ -72,10 +72,14 @@ enum Conduct {
     Vanishes,
     /// Sends an episode with a class out of range.
     SendsGarbage,
-    /// Sends everything twice, and what it does not hold, and what is of another epoch or version.
-    SendsTooMuch,
-    /// Sends the first five episodes of every message of leases.
+    /// Sends everything twice.
+    SendsTwice,
+    /// Sends the first episode of every message of leases twice, and not the second.
+    Doubles,
+    /// Sends the first five episodes of every message of leases, and the others when the epoch is closed.
     SendsFive,
+    /// Sends heartbeats and nothing else, as fast as it can.
+    Beats,
     /// Takes leases, and sends nothing.
     Sits,
 }
@@ -120,6 +124,7 @@ fn hello(name: &str) -> Hello {
         protocol_version: PROTOCOL_VERSION,
         build: "test".to_owned(),
         actor: name.to_owned(),
+        key: 1,
         incarnation: 1,
         slots: 8,
         run: None,
@@ -139,7 +144,7 @@ async fn simulate(
     requests.send(ActorMessage::Hello(hello).into_wire()).await.unwrap();
     let mut replies = transport::client(channel).session(ReceiverStream::new(stream)).await?.into_inner();
     let send = async |message: ActorMessage| drop(requests.send(message.into_wire()).await);
-    let mut version = 0;
+    let (mut version, mut late) = (0, Vec::new());
     while let Some(message) = replies.message().await? {
         match LearnerMessage::from_wire(message).unwrap() {
             LearnerMessage::Welcome(_) => send(ActorMessage::Ready(fingerprint)).await,
@@ -152,13 +157,25 @@ async fn simulate(
                 let epoch = leases.epoch;
                 let episodes: Vec<Episode> = leases.episodes.iter().map(|&index| self::episode(epoch, index)).collect();
                 let mut batch = EpisodeBatch { epoch, version, episodes };
-                if conduct == Conduct::SendsFive {
-                    batch.episodes.truncate(5);
-                }
                 match conduct {
                     Conduct::Sits => {}
                     Conduct::Vanishes => return Ok("vanished".to_owned()),
-                    Conduct::Honest | Conduct::SendsFive => send(ActorMessage::Episodes(batch)).await,
+                    Conduct::Honest => send(ActorMessage::Episodes(batch)).await,
+                    Conduct::SendsFive => {
+                        late.extend(batch.episodes.split_off(batch.episodes.len().min(5)));
+                        send(ActorMessage::Episodes(batch)).await;
+                    }
+                    Conduct::SendsTwice => {
+                        send(ActorMessage::Episodes(batch.clone())).await;
+                        send(ActorMessage::Episodes(batch)).await;
+                    }
+                    Conduct::Doubles => {
+                        if batch.episodes.len() > 1 {
+                            batch.episodes[1] = batch.episodes[0].clone();
+                        }
+                        send(ActorMessage::Episodes(batch)).await;
+                    }
+                    Conduct::Beats => while requests.send(ActorMessage::Heartbeat.into_wire()).await.is_ok() {},
                     Conduct::SendsGarbage => {
                         let mut wire = ActorMessage::Episodes(batch).into_wire();
                         if let Some(wire::from_actor::Message::Episodes(batch)) = &mut wire.message {
@@ -167,17 +184,15 @@ async fn simulate(
                         }
                         drop(requests.send(wire).await);
                     }
-                    Conduct::SendsTooMuch => {
-                        let other = EpisodeBatch { epoch: epoch + 1, ..batch.clone() };
-                        let untimely = EpisodeBatch { version: version + 9, ..batch.clone() };
-                        let unleased = EpisodeBatch { episodes: vec![self::episode(epoch, 1 << 40)], ..batch.clone() };
-                        for batch in [other, untimely, unleased, batch.clone(), batch] {
-                            send(ActorMessage::Episodes(batch)).await;
-                        }
-                    }
                 }
             }
-            LearnerMessage::Closed { epoch } => seen.lock().unwrap().closed.push(epoch),
+            LearnerMessage::Closed { epoch } => {
+                let episodes = std::mem::take(&mut late);
+                if !episodes.is_empty() {
+                    send(ActorMessage::Episodes(EpisodeBatch { epoch, version, episodes })).await;
+                }
+                seen.lock().unwrap().closed.push(epoch);
+            }
             LearnerMessage::Stop { reason } => return Ok(reason),
             LearnerMessage::Heartbeat => {}
         }
@@ -305,17 +320,37 @@ fn an_illegal_episode_ends_its_session_and_nothing_else() {
 }
 
 #[test]
-fn what_nobody_asked_for_changes_nothing() {
+fn what_nobody_asked_for_ends_its_session_and_changes_nothing() {
+    let target = Target::Steps(1_500);
+    for (conduct, told) in
+        [(Conduct::SendsTwice, "episodes in a session that was leased"), (Conduct::Beats, "too many heartbeats")]
+    {
+        let service = service();
+        let actors = Actors::of(&service);
+        let busy = actors.spawn("busy", conduct);
+        wait_for("an actor", || service.actors() == 1);
+        service.open(0, 0, WEIGHTS, target).unwrap();
+        let status = actors.end(busy).unwrap_err();
+        assert!(status.message().contains(told), "{status}");
+        let _honest = actors.spawn("honest", Conduct::Honest);
+        assert_eq!(collect(&service).episodes, expected(0, target));
+    }
+}
+
+#[test]
+fn an_episode_that_comes_twice_counts_once() {
     let service = service();
     let actors = Actors::of(&service);
-    let _busy = actors.spawn("busy", Conduct::SendsTooMuch);
-    for epoch in 0..3 {
-        let target = Target::Steps(1_500);
-        service.open(epoch, epoch, WEIGHTS, target).unwrap();
-        let collected = collect(&service);
-        assert_eq!(collected.episodes, expected(epoch, target));
-    }
-    assert_eq!(service.actors(), 1);
+    let doubling = actors.spawn("doubling", Conduct::Doubles);
+    wait_for("an actor", || service.actors() == 1);
+    let target = Target::Steps(3_000);
+    service.open(0, 0, WEIGHTS, target).unwrap();
+    // It still holds what it did not send: its session goes on, until that is taken from it.
+    wait_for("leases", || !doubling.seen.lock().unwrap().leases.is_empty());
+    let _honest = actors.spawn("honest", Conduct::Honest);
+    wait_for("two actors", || service.actors() == 2);
+    doubling.end.abort();
+    assert_eq!(collect(&service).episodes, expected(0, target));
 }
 
 #[test]
@@ -341,19 +376,28 @@ fn weights_are_sent_once_a_version_and_to_newcomers() {
 fn an_actor_that_connects_anew_replaces_its_older_self() {
     let service = service();
     let actors = Actors::of(&service);
-    let older = actors.spawn("twin", Conduct::Sits);
+    let older = actors.spawn("one", Conduct::Sits);
     service.open(0, 0, WEIGHTS, Target::Episodes(10)).unwrap();
     wait_for("leases", || !older.seen.lock().unwrap().leases.is_empty());
     let seen = Arc::default();
-    let newer = Hello { incarnation: 2, ..hello("twin") };
+    let newer = Hello { incarnation: 2, ..hello("one") };
     actors.runtime.spawn(simulate(actors.address, newer, FINGERPRINT, Conduct::Honest, seen));
     assert_eq!(collect(&service).episodes, expected(0, Target::Episodes(10)));
     assert_eq!(actors.end(older).unwrap_err().code(), tonic::Code::FailedPrecondition);
     // And an older one does not replace a newer.
-    let stale = simulate(actors.address, hello("twin"), FINGERPRINT, Conduct::Honest, Arc::default());
+    let stale = simulate(actors.address, hello("one"), FINGERPRINT, Conduct::Honest, Arc::default());
     let status = actors.runtime.block_on(stale).unwrap_err();
-    assert!(status.message().contains("--name"), "{status}");
+    assert_eq!(status.message(), "this actor has connected anew since");
     assert_eq!(service.actors(), 1);
+    // Who has its name and not its key is another.
+    for incarnation in [0, u64::MAX] {
+        let thief = Hello { key: 2 + incarnation % 2, incarnation, ..hello("one") };
+        actors.runtime.spawn(simulate(actors.address, thief, FINGERPRINT, Conduct::Honest, Arc::default()));
+    }
+    wait_for("three actors", || service.actors() == 3);
+    service.open(1, 1, WEIGHTS, Target::Steps(1_000)).unwrap();
+    assert_eq!(collect(&service).episodes, expected(1, Target::Steps(1_000)));
+    assert_eq!(service.actors(), 3);
 }
 
 #[test]
@@ -368,6 +412,9 @@ fn what_is_under_way_is_called_off_when_the_batch_is_complete() {
     assert_eq!(collect(&service).episodes, expected(LONG, Target::Episodes(5)));
     wait_for("the call", || actor.seen.lock().unwrap().closed == [LONG]);
     assert!(actor.seen.lock().unwrap().leases.len() > 10);
+    // What comes late answers a lease too: no reason to part.
+    service.open(0, 0, WEIGHTS, Target::Episodes(5)).unwrap();
+    assert_eq!(collect(&service).episodes, expected(0, Target::Episodes(5)));
     assert_eq!(service.actors(), 1);
 }
 
