@@ -8,6 +8,8 @@
 //! | [`terminal`] | a program on a terminal of its own: keys in, the screen out |
 //! | [`account`] | the checker of `events.jsonl` |
 //! | [`authority`] | certificates |
+//! | [`attacked`] | a run with an actor that works, and those who attack it |
+//! | [`hostile`] | a client that lies |
 //! | [`net`] | a free port, a plain HTTP request, the health service |
 //!
 //! Every wait has the same generous deadline: it only tells a test that hangs from one on a busy machine.
@@ -16,7 +18,9 @@
 use std::time::{Duration, Instant};
 
 pub mod account;
+pub mod attacked;
 pub mod authority;
+pub mod hostile;
 pub mod net;
 pub mod process;
 pub mod scene;

@@ -35,6 +35,12 @@ pub fn get(address: &str, path: &str, expected: &[&str]) -> String {
     })
 }
 
+/// The value of a counter in what Prometheus sees, 0 where it is not there.
+pub fn counter(metrics: &str, name: &str) -> u64 {
+    let value = metrics.lines().find_map(|line| line.strip_prefix(name)?.strip_prefix(' ')?.parse().ok());
+    value.unwrap_or(0)
+}
+
 fn request(address: &str, path: &str) -> io::Result<String> {
     let mut stream = TcpStream::connect(address)?;
     stream.set_read_timeout(Some(DEADLINE))?;

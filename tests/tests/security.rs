@@ -75,12 +75,6 @@ fn those_who_belong_here_get_the_same_curve() {
     scene.learner(&["eval", "local", "--episodes", "8"]).expect(0);
 }
 
-/// The value of a counter, 0 where it is not there.
-fn counter(metrics: &str, name: &str) -> u64 {
-    let value = metrics.lines().find_map(|line| line.strip_prefix(name)?.strip_prefix(' ')?.parse().ok());
-    value.unwrap_or(0)
-}
-
 fn assert_stays_out(actor: Process, code: i32, reason: &str) {
     let outcome = actor.expect(code);
     assert!(outcome.stderr.contains(reason), "`{reason}`: {}", outcome.stderr);
@@ -112,10 +106,11 @@ fn strangers_are_refused_counted_and_told_of_once() {
     until("the end of a silent connection", || (silent.read(&mut [0]).unwrap_or(0) == 0).then_some(()));
 
     let seen = net::get(&metrics, "/metrics", &["popgym_learner_connections_refused_total"]);
-    let refused = |reason| counter(&seen, &format!("popgym_learner_connections_refused_total{{reason=\"{reason}\"}}"));
+    let refused =
+        |reason| net::counter(&seen, &format!("popgym_learner_connections_refused_total{{reason=\"{reason}\"}}"));
     assert_eq!(refused("token"), 2, "{seen}");
     assert!(refused("tls") >= 4, "{seen}");
-    assert_eq!(counter(&seen, "popgym_learner_sessions_total"), 0);
+    assert_eq!(net::counter(&seen, "popgym_learner_sessions_total"), 0);
     let log = learner.stderr();
     let (told, minutes) = (log.matches("refused 127.0.0.1: ").count() as u64, begun.elapsed().as_secs() / 60);
     assert!((1..=1 + minutes).contains(&told), "once a minute: {log}");
