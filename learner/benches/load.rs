@@ -229,6 +229,7 @@ async fn one_actor(address: SocketAddr, number: usize, episode: Episode, pace: O
         protocol_version: PROTOCOL_VERSION,
         build: "bench".to_owned(),
         actor: format!("actor-{number}"),
+        key: number as u64,
         incarnation: 1,
         slots: 16,
         run: None,

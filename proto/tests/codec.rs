@@ -68,10 +68,11 @@ fn episode() -> impl Strategy<Value = Episode> {
 }
 
 fn actor_message() -> impl Strategy<Value = ActorMessage> {
-    let hello = (any::<u32>(), prop_oneof![Just(String::new()), name()], name(), any::<u64>(), 1..=4096_u32);
+    let incarnation = (any::<u64>(), any::<u64>());
+    let hello = (any::<u32>(), prop_oneof![Just(String::new()), name()], name(), incarnation, 1..=4096_u32);
     let hello = (hello, proptest::option::of(name())).prop_map(
-        |((protocol_version, build, actor, incarnation, slots), run)| {
-            ActorMessage::Hello(Hello { protocol_version, build, actor, incarnation, slots, run })
+        |((protocol_version, build, actor, (key, incarnation), slots), run)| {
+            ActorMessage::Hello(Hello { protocol_version, build, actor, key, incarnation, slots, run })
         },
     );
     let batch = (any::<u64>(), any::<u64>(), vec(episode(), 1..4))

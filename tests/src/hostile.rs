@@ -241,17 +241,13 @@ impl Reader {
                     return Ok(self.buffer.split_to(length).split_off(5).freeze());
                 }
             }
-            match stream.data().await {
-                Some(data) => {
-                    let data = data.map_err(lost)?;
-                    stream.flow_control().release_capacity(data.len()).map_err(lost)?;
-                    self.buffer.extend_from_slice(&data);
-                }
-                None => {
-                    let trailers = stream.trailers().await.map_err(lost)?.unwrap_or_default();
-                    return Err(Status::from_header_map(&trailers).unwrap_or(Status::unavailable("no status")));
-                }
-            }
+            let Some(data) = stream.data().await else {
+                let trailers = stream.trailers().await.map_err(lost)?.unwrap_or_default();
+                return Err(Status::from_header_map(&trailers).unwrap_or(Status::unavailable("no status")));
+            };
+            let data = data.map_err(lost)?;
+            stream.flow_control().release_capacity(data.len()).map_err(lost)?;
+            self.buffer.extend_from_slice(&data);
         }
     }
 }

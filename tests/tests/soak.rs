@@ -220,6 +220,11 @@ fn name(i: usize) -> String {
     format!("remote-{i}")
 }
 
+/// Whether it is this actor's, who has a number behind its name while the connection it had before is not given up.
+fn is_name(actor: &str, i: usize) -> bool {
+    actor.split('#').next() == Some(&name(i))
+}
+
 /// From a fault to the next lease of who was struck, in seconds.
 struct Recovery {
     what: &'static str,
@@ -249,10 +254,10 @@ fn recoveries(account: &str, struck: &[(f64, Fault, bool)]) -> Vec<Recovery> {
                 ("a killed local actor's replacement", 3.0, leased(time, &|actor| !actor.starts_with("remote")))
             }
             Fault::KillActor(i) => {
-                ("a killed remote actor's replacement", 3.0, leased(time, &|actor| actor == name(i)))
+                ("a killed remote actor's replacement", 3.0, leased(time, &|actor| is_name(actor, i)))
             }
             Fault::KillLearner => {
-                let all = (0..REMOTE).map(|i| leased(time, &|actor| actor == name(i)));
+                let all = (0..REMOTE).map(|i| leased(time, &|actor| is_name(actor, i)));
                 let last = all.collect::<Option<Vec<f64>>>().map(|times| times.into_iter().fold(0.0, f64::max));
                 ("all actors, after the learner was killed", 5.0, last)
             }

@@ -73,6 +73,7 @@ fn actor_messages() -> Vec<ActorMessage> {
         protocol_version: PROTOCOL_VERSION,
         build: "0.1.0".to_owned(),
         actor: "actor-1".to_owned(),
+        key: 7,
         incarnation: 2,
         slots: 128,
         run: Some("first".to_owned()),
