@@ -121,7 +121,11 @@ impl Fleet {
         self.local.extend(self.learner.actors());
         self.struck.push((now(), fault, self.recoveries.is_empty()));
         match fault {
-            Fault::KillLocalActors => self.learner.actors().iter().for_each(|actor| actor.signal(Signal::KILL)),
+            Fault::KillLocalActors => {
+                for actor in self.learner.actors() {
+                    actor.signal(Signal::KILL);
+                }
+            }
             Fault::KillActor(i) => {
                 self.recoveries.retain(|(_, fault)| !matches!(fault, Fault::FreezeActor(frozen, _) if *frozen == i));
                 self.actors[i].kill();
@@ -195,7 +199,9 @@ impl Fleet {
         let mut learner = self.scene.resume("run", &["--steps", &steps, "--listen", &self.listen]);
         self.local.extend(learner.actors());
         finish(learner);
-        self.actors.into_iter().for_each(|actor| drop(actor.expect(0)));
+        for actor in self.actors {
+            actor.expect(0);
+        }
         Life::expect_gone(&self.local);
         let scene = Scene::new();
         finish(scene.train("undisturbed", &["--lag", lag, "--steps", &steps]));
@@ -314,7 +320,9 @@ fn survives(lag: &str) {
         println!(
             "lag {lag}, {faults} faults, seed {seed}; the learner's memory in the second half: {least} to {most} bytes"
         );
-        recoveries.iter().for_each(|recovery| println!("{recovery}"));
+        for recovery in &recoveries {
+            println!("{recovery}");
+        }
         assert!(most - least <= most / 20, "the learner's memory is not flat: {least} to {most} bytes");
         assert!(recoveries.iter().all(|recovery| recovery.seconds <= recovery.bound), "too late");
     }
