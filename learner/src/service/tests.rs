@@ -6,6 +6,7 @@ use std::time::Instant;
 
 use popgym_envs::space::Space;
 use popgym_proto::{ActorMessage, Columns, EpisodeBatch, Hello, LearnerMessage, OpenEpoch, PROTOCOL_VERSION};
+use prost::Message as _;
 use tokio::runtime::Runtime;
 
 use super::*;
@@ -179,8 +180,9 @@ async fn simulate(
                     Conduct::SendsGarbage => {
                         let mut wire = ActorMessage::Episodes(batch).into_wire();
                         if let Some(wire::from_actor::Message::Episodes(batch)) = &mut wire.message {
-                            batch.episodes[0].actions_discrete =
-                                vec![77; batch.episodes[0].actions_discrete.len()].into();
+                            let mut episode = wire::Episode::decode(&batch.episodes[0][..]).unwrap();
+                            episode.actions_discrete = vec![77; episode.actions_discrete.len()].into();
+                            batch.episodes[0] = episode.encode_to_vec().into();
                         }
                         drop(requests.send(wire).await);
                     }
