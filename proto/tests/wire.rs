@@ -255,7 +255,10 @@ fn a_run_survives_the_wire() {
     assert_eq!(refused(&|r| r.lag = 2), "lag is 2, allowed is 0..=1");
     assert_eq!(refused(&|r| r.rows = 3), "rows is 3, allowed is 16..=4096");
     assert_eq!(refused(&|r| r.run.clear()), "run has length 0, allowed is 1..=128 characters");
-    assert_eq!(refused(&|r| r.env = "a\nb".to_owned()), "env is `a\\nb`, allowed is a name without white space");
+    assert_eq!(
+        refused(&|r| r.env = "a\nb".to_owned()),
+        "env is `a\\nb`, allowed is a name without white space and invisible characters"
+    );
     assert!(refused(&|r| r.memory_options = "= 3".to_owned()).starts_with("memory_options is not TOML: "));
     assert_eq!(
         refused(&|r| r.observability = "all".to_owned()),

@@ -3,7 +3,7 @@
 
 use std::net::Ipv4Addr;
 
-use popgym_proto::{ActorMessage, Hello, limits, wire};
+use popgym_proto::{ActorMessage, Hello, LearnerMessage, limits, wire};
 use popgym_tests::attacked::{Attacked, RUN, WINDOW, undisturbed};
 use popgym_tests::hostile::{Connection, framed, hello};
 use prost::Message as _;
@@ -152,6 +152,9 @@ fn every_lie_is_answered_counted_and_without_effect() {
                 let mut session = connection.session().await.expect("a session");
                 if ready {
                     session.join(hello("liar", 16), run.fingerprint).await.expect("a welcome");
+                    // Before it is known to be ready, a large message would be too much from a stranger.
+                    let told = session.reader.next().await.expect("the open epoch");
+                    assert!(matches!(told, LearnerMessage::Epoch(_)), "{told:?}");
                 }
                 // Fails where the learner has heard enough.
                 let _ = session.send_raw(sent.into()).await;
