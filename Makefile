@@ -33,7 +33,7 @@ test: setup ## all tests
 	$(CARGO) test $(CARGO_FLAGS) --workspace
 
 soak: setup ## the long forms of tests: 200 random faults in a run, hostile actors for minutes, with their figures
-	POPGYM_SOAK=1 $(CARGO) test $(CARGO_FLAGS) --workspace --test soak -- --nocapture --test-threads 1
+	POPGYM_SOAK=1 $(CARGO) test $(CARGO_FLAGS) --workspace --test soak --test floods -- --nocapture --test-threads 1
 
 lint: setup ## formatting, clippy, and licences and advisories where cargo-deny is installed
 	$(CARGO) fmt --all --check

@@ -231,11 +231,15 @@ fn sigterm_gives_a_time_of_grace() {
     scene.reached(&mut learner, "run", 5);
     // An actor that does not react: the learner waits longer for it than it is given.
     let actors = learner.actors();
-    actors.iter().for_each(|actor| actor.signal(Signal::STOP));
+    for actor in &actors {
+        actor.signal(Signal::STOP);
+    }
     learner.signal(Signal::TERM);
     let log = learner.expect(1).stderr;
     assert!(log.contains("the time of grace is over"), "{log}");
-    actors.iter().for_each(|actor| actor.signal(Signal::CONT));
+    for actor in &actors {
+        actor.signal(Signal::CONT);
+    }
     Life::expect_gone(&actors);
     assert_eq!(scene.json("run/summary.json")["stopped_by"], "interrupt");
     scene.resume("run", &[]).expect(0);

@@ -117,7 +117,7 @@ fn actors_that_send_nothing_of_use_are_cut() {
         let (connection, _session) = run.joined(Ipv4Addr::new(127, 0, 1, 3), hello("elsewhere", 1)).await;
         let before = run.counters([&flood]);
         while let Ok(mut call) = connection.call(HEALTH, HeaderMap::new()).await {
-            let _ = call.send_bytes(&[0xff; 1 << 20]).await;
+            let _ = call.send_bytes(&vec![0xff; 1 << 20]).await;
             call.reader.end().await;
         }
         assert_eq!(run.counters([&flood]), before.map(|count| count + 1));

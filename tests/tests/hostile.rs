@@ -201,7 +201,7 @@ fn episodes_without_a_lease_are_refused_and_soon_their_sender() {
             let (_connection, mut session) = run.joined(from, hello("liar", 4096)).await;
             let (open, leases) = session.held(1).await.expect("leases");
             let (epoch, version, held) = (open.epoch, open.version, leases.episodes);
-            let other = (0..).find(|index| !held.contains(index)).expect("an index");
+            let other = (0..=u64::MAX).find(|index| !held.contains(index)).expect("an index");
             let mut credit = held.len();
             loop {
                 let (epoch, version, indices) = match lies.next().expect("no end") {

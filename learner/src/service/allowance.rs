@@ -89,7 +89,7 @@ mod tests {
         // A heartbeat every 5 s for an hour, four of them at once now and then.
         let mut heartbeats = Bucket::new(limits::HEARTBEATS, now);
         for i in 0..720 {
-            let late = if i % 10 < 3 { 3 - i % 10 } else { 0 };
+            let late = 3_u32.saturating_sub(i % 10);
             assert!(heartbeats.take(now + limits::HEARTBEAT_INTERVAL * (i + late)));
         }
         // All actors behind one address lose their learner, twice within five minutes.

@@ -48,7 +48,7 @@ fn who_keeps_the_others_waiting_loses_its_leases() {
     let (mut coordinator, [mut idle, _working]) = coordinator();
     send_all(&mut coordinator, 1);
     let now = Instant::now();
-    coordinator.take_overdue(now + limits::LEASE_PATIENCE - Duration::from_secs(1));
+    coordinator.take_overdue(now + limits::LEASE_PATIENCE.saturating_sub(Duration::from_secs(1)));
     assert_eq!(held(&coordinator), [(0, 10), (1, 0)]);
     coordinator.take_overdue(now + limits::LEASE_PATIENCE + Duration::from_secs(1));
     coordinator.lease();
