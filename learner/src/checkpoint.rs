@@ -355,6 +355,32 @@ mod tests {
     }
 
     #[test]
+    fn what_no_run_writes_is_refused() {
+        let files = BTreeMap::from_iter(checkpoint(12, 0.25).to_files(&Value::Null).unwrap());
+        let manifest = String::from_utf8(files[MANIFEST].to_vec()).unwrap();
+        let read = |manifest: &str| {
+            Checkpoint::from_files(3, |name| {
+                let changed = (name == MANIFEST).then(|| Bytes::from(manifest.to_owned()));
+                changed.or_else(|| files.get(name).cloned()).with_context(|| format!("{name} was read"))
+            })
+        };
+        assert!(read(&manifest).is_ok());
+        for (from, to, expected) in [
+            ("sampling.safetensors", "../sampling", "manifest.json names a file `../sampling`"),
+            (": 120,", ": 9007199254740993,", "env_steps is 9007199254740993, allowed is at most 9007199254740992"),
+            (": 7,", ": 18446744073709551615,", "optimizer_steps is 18446744073709551615"),
+            (": 0.2,", ": -0.2,", "kl_coef is -0.2, allowed is 0 or more"),
+            (": 1.5", ": 1e999", "manifest.json is not a manifest: number out of range"),
+            ("\"format\": 1", "\"format\": 2", "manifest.json has format 2, expected 1"),
+        ] {
+            let changed = manifest.replace(from, to);
+            assert_ne!(changed, manifest, "{from}");
+            let error = format!("{:#}", read(&changed).err().expect(to));
+            assert!(error.contains(expected), "{error}");
+        }
+    }
+
+    #[test]
     fn the_newest_that_can_be_used() {
         let dir = tempfile::tempdir().unwrap();
         assert!(Checkpoint::latest(dir.path(), 3, 9).unwrap().is_none());
