@@ -1,9 +1,9 @@
 //! The command line.
 
-use std::net::SocketAddr;
+use std::net::{IpAddr, SocketAddr};
 use std::path::PathBuf;
 
-use popgym_proto::{limits, transport};
+use popgym_proto::{error, limits, transport};
 
 /// Steps environments and streams episodes to a learner.
 ///
@@ -18,6 +18,10 @@ pub struct Args {
     /// File of the token that the learner wants to see
     #[arg(long, env = "POPGYM_TOKEN_FILE", value_name = "FILE")]
     pub token_file: Option<PathBuf>,
+
+    /// Show the token even where the network can read it, to http:// on another machine
+    #[arg(long, env = "POPGYM_INSECURE")]
+    pub insecure: bool,
 
     /// File of the CA that signed the learner's certificate, PEM; needed for https://
     #[arg(long, env = "POPGYM_TLS_CA", value_name = "FILE")]
@@ -47,8 +51,8 @@ pub struct Args {
     #[arg(long, env = "POPGYM_ACTOR_METRICS_LISTEN", value_name = "ADDR", value_parser = transport::metrics_address)]
     pub metrics_listen: Option<SocketAddr>,
 
-    /// Give up when there has been no learner for this long
-    #[arg(long, env = "POPGYM_RETRY_SECONDS", value_name = "S", default_value_t = 300)]
+    /// Give up when there has been no learner for this long, a year at most
+    #[arg(long, env = "POPGYM_RETRY_SECONDS", value_name = "S", default_value_t = 300, value_parser = clap::value_parser!(u64).range(..=31_536_000))]
     pub retry_seconds: u64,
 
     /// End when standard input ends: with the process that started this one
@@ -66,6 +70,13 @@ impl Args {
     /// # Errors
     /// The flag that is missing or has no use.
     pub fn validate(&self) -> Result<(), String> {
+        if self.token_file.is_some() && !self.insecure && is_readable(&self.learner) {
+            return Err(format!(
+                "--learner is {}, where whoever is on the way reads the token: allowed with --token-file is https://HOST:PORT, \
+                 or --insecure on a network whose every user you trust",
+                self.learner
+            ));
+        }
         match (self.learner.starts_with("https://"), &self.tls_ca) {
             (true, None) => Err(format!(
                 "--learner is {}, which needs --tls-ca: the file of the CA that signed the learner's certificate",
@@ -94,15 +105,16 @@ fn learner_url(text: &str) -> Result<String, String> {
     }
 }
 
+/// Whether what is sent to this learner can be read by others on the way: no TLS, and not this machine.
+fn is_readable(url: &str) -> bool {
+    let Some(host) = url.strip_prefix("http://") else { return false };
+    let host = host.rsplit_once(':').map_or(host, |(host, _)| host);
+    let address: Option<IpAddr> = host.trim_matches(['[', ']']).parse().ok();
+    host != "localhost" && !address.is_some_and(|address| address.to_canonical().is_loopback())
+}
+
 fn name(text: &str) -> Result<String, String> {
-    let legal = !text.is_empty()
-        && text.chars().count() <= limits::MAX_NAME_CHARS
-        && !text.chars().any(|c| c.is_whitespace() || c.is_control());
-    if legal {
-        Ok(text.to_owned())
-    } else {
-        Err(format!("expected 1 to {} characters, none of them white space", limits::MAX_NAME_CHARS))
-    }
+    error::name("the name", text.to_owned(), 1).map_err(|error| error.to_string())
 }
 
 #[cfg(test)]
@@ -142,8 +154,31 @@ mod tests {
     }
 
     #[test]
+    fn a_token_is_shown_to_nobody_on_the_way() {
+        let valid = |learner: &str, more: &[&str]| {
+            parse(&[&["--learner", learner, "--token-file", "token"], more].concat()).unwrap().validate()
+        };
+        for own in ["localhost:1", "127.0.0.1:1", "http://[::1]:1", "127.8.8.8:1"] {
+            assert_eq!(valid(own, &[]), Ok(()), "{own}");
+        }
+        assert_eq!(valid("https://box:1", &["--tls-ca", "ca.pem"]), Ok(()));
+        for far in ["box:1", "http://10.0.0.1:1", "[2001:db8::1]:1", "localhost.example.org:1", "0.0.0.0:1"] {
+            assert!(valid(far, &[]).unwrap_err().contains("--insecure"), "{far}");
+            assert_eq!(valid(far, &["--insecure"]), Ok(()), "{far}");
+        }
+    }
+
+    #[test]
     fn numbers_have_limits() {
-        for wrong in [["--slots", "0"], ["--slots", "4097"], ["--nice", "20"], ["--name", "a b"], ["--run", ""]] {
+        for wrong in [
+            ["--slots", "0"],
+            ["--slots", "4097"],
+            ["--nice", "20"],
+            ["--name", "a b"],
+            ["--name", "a\u{200b}b"],
+            ["--run", ""],
+            ["--retry-seconds", "31536001"],
+        ] {
             assert!(parse(&["--learner", "a:1", wrong[0], wrong[1]]).is_err(), "{wrong:?}");
         }
     }

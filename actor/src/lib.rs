@@ -11,8 +11,8 @@
 //! | [`invariance`] | whether a row's result depends on the number of rows, on this machine |
 //! | [`metrics`] | what Prometheus sees |
 //!
-//! Two threads: the network's (tokio) and libtorch's. Bounded channels between them; neither ever waits for the other
-//! to compute.
+//! Two threads: the network's (tokio) and libtorch's. Bounded channels between them: while the network is behind, the
+//! rollout waits for it.
 //!
 //! An actor holds nothing that is worth saving: if it dies, its leases are leased again.
 #![forbid(unsafe_code)]
@@ -23,6 +23,7 @@ use std::process::ExitCode;
 use std::time::{Duration, Instant};
 
 use clap::Parser as _;
+use tokio::signal::unix::{SignalKind, signal};
 use tracing::info;
 use tracing_subscriber::EnvFilter;
 
@@ -95,6 +96,7 @@ fn start(envs: popgym_envs::Registry, memories: popgym_models::memory::Registry,
         tokio::select! {
             result = stay_connected(args, &worker) => result,
             () = parent_gone(args.with_parent) => Ok(()),
+            () = terminated() => Err(anyhow::anyhow!("terminated")),
         }
     });
     // Ends the worker's thread before the process: libtorch must not be torn down under it.
@@ -107,9 +109,9 @@ async fn stay_connected(args: &Args, worker: &Worker) -> anyhow::Result<()> {
     let patience = Duration::from_secs(args.retry_seconds);
     let mut identity = Identity::new(args);
     let mut backoff = Backoff::new(BACKOFF.0, BACKOFF.1)?;
-    let (mut give_up_at, mut announced) = (Instant::now() + patience, false);
+    let (mut give_up_at, mut announced, mut known) = (Instant::now() + patience, false, false);
     loop {
-        let (reason, welcomed) = match session::run(args, identity.hello(), worker).await {
+        let (reason, welcomed) = match session::run(args, identity.hello(), worker, known).await {
             End::Complete(reason) => {
                 info!("run complete: {reason}");
                 return Ok(());
@@ -118,6 +120,7 @@ async fn stay_connected(args: &Args, worker: &Worker) -> anyhow::Result<()> {
             End::Lost { reason, welcomed } => (reason, welcomed),
         };
         if welcomed {
+            known = true;
             metrics::reconnecting();
             backoff.reset();
             (give_up_at, announced) = (Instant::now() + patience, false);
@@ -132,6 +135,14 @@ async fn stay_connected(args: &Args, worker: &Worker) -> anyhow::Result<()> {
         }
         tokio::time::sleep(backoff.next_wait().min(left)).await;
     }
+}
+
+/// Resolves at SIGTERM, if this is the first process of a container: the system ends any other one by itself, but not
+/// that one.
+async fn terminated() {
+    let signals = (std::process::id() == 1).then(|| signal(SignalKind::terminate()).ok()).flatten();
+    let Some(mut signals) = signals else { return std::future::pending().await };
+    signals.recv().await;
 }
 
 /// Resolves when standard input ends, which is when the process that holds its other end has gone. Never if not `asked`.

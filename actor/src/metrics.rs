@@ -4,7 +4,7 @@ use std::net::SocketAddr;
 use std::time::{Duration, Instant};
 
 use metrics::{counter, describe_counter, describe_gauge, gauge};
-use metrics_exporter_prometheus::PrometheusBuilder;
+use popgym_proto::monitor;
 
 /// What the worker's time goes to.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -38,10 +38,7 @@ const FLUSH_INTERVAL: Duration = Duration::from_millis(250);
 /// An address that cannot be listened on.
 pub fn install(listen: Option<SocketAddr>) -> anyhow::Result<()> {
     let Some(address) = listen else { return Ok(()) };
-    PrometheusBuilder::new()
-        .with_http_listener(address)
-        .install()
-        .map_err(|error| anyhow::anyhow!("cannot serve metrics at {address}: {error}"))?;
+    monitor::serve(address, axum::Router::new()).map_err(anyhow::Error::msg)?;
     describe_counter!("popgym_actor_steps_total", "Environment steps");
     describe_counter!("popgym_actor_episodes_total", "Episodes finished and sent");
     describe_counter!("popgym_actor_sent_bytes_total", "Bytes of the episodes' columns");

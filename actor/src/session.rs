@@ -2,7 +2,7 @@
 
 use std::hash::{BuildHasher as _, RandomState};
 
-use popgym_proto::{ActorMessage, Hello, LearnerMessage, PROTOCOL_VERSION, RunSpec, limits, transport, wire};
+use popgym_proto::{ActorMessage, Hello, LearnerMessage, PROTOCOL_VERSION, RunSpec, limits, monitor, transport, wire};
 use tokio::sync::{mpsc, oneshot};
 use tokio::time::{MissedTickBehavior, interval, timeout};
 use tokio_stream::wrappers::ReceiverStream;
@@ -67,16 +67,21 @@ impl Identity {
     }
 }
 
-/// One session, from connecting to its end.
-pub async fn run(args: &Args, hello: Hello, worker: &Worker) -> End {
+/// One session, from connecting to its end. `known`: this learner has taken this actor's credentials before, so that files
+/// which are no good now are being replaced.
+pub async fn run(args: &Args, hello: Hello, worker: &Worker, known: bool) -> End {
     let expected_run = hello.run.clone();
     let (to_learner, requests) = mpsc::channel(limits::STREAM_QUEUE);
     let door = match Door::new(args) {
         Ok(door) => door,
+        Err(reason) if known => return End::Lost { reason, welcomed: false },
         Err(problem) => return End::Failed(problem),
     };
     let mut replies = match connect(door, hello, &to_learner, requests).await {
         Ok(replies) => replies,
+        Err(status) if known && status.code() == Code::Unauthenticated => {
+            return End::Lost { reason: status.message().to_owned(), welcomed: false };
+        }
         Err(status) => return ended(&status, false),
     };
     let spec = match welcome(&mut replies, expected_run.as_deref()).await {
@@ -88,6 +93,7 @@ pub async fn run(args: &Args, hello: Hello, worker: &Worker) -> End {
         end = listen(&mut replies, spec, outputs, &to_learner, worker) => end,
         end = speak(from_worker, &to_learner, worker) => end,
     };
+    monitor::set_ready(false);
     // `from_worker` is gone, so a worker that waits for room in it is free by now.
     if !worker.send(Command::Disconnected).await {
         return worker_died();
@@ -144,16 +150,17 @@ async fn listen(
         Ok(Ok(fingerprint)) => {
             // If this fails the stream has ended, and the next read says why.
             let _ = to_learner.send(ActorMessage::Ready(fingerprint).into_wire()).await;
+            monitor::set_ready(true);
         }
         Ok(Err(error)) => return End::Failed(format!("this actor cannot build the run's policy: {error:#}")),
         Err(_) => return worker_died(),
     }
     loop {
-        let message = match timeout(limits::SILENCE_LIMIT, next(replies, true)).await {
+        let message = match timeout(limits::MESSAGE_DEADLINE, next(replies, true)).await {
             Ok(Ok(message)) => message,
             Ok(Err(end)) => return end,
             Err(_) => {
-                let reason = format!("the learner was silent for {} s", limits::SILENCE_LIMIT.as_secs());
+                let reason = format!("the learner was silent for {} s", limits::MESSAGE_DEADLINE.as_secs());
                 return End::Lost { reason, welcomed: true };
             }
         };
@@ -193,8 +200,9 @@ async fn speak(
             _ = heartbeat.tick() => ActorMessage::Heartbeat.into_wire(),
         };
         if to_learner.send(message).await.is_err() {
-            // The stream has ended; `listen` has the learner's own word for it.
-            std::future::pending::<()>().await;
+            // The stream has ended; `listen` has the learner's own word for it, and needs a worker that does not wait for us.
+            drop(from_worker);
+            return std::future::pending().await;
         }
     }
 }
@@ -218,8 +226,11 @@ fn ended(status: &Status, welcomed: bool) -> End {
         Code::Unimplemented => End::Failed("whoever listens there is not a learner of popgym-rs".to_owned()),
         Code::OutOfRange => End::Failed(format!("a message is too large: {}", status.message())),
         _ => {
-            let message = if status.message().is_empty() { status.code().description() } else { status.message() };
-            End::Lost { reason: message.to_owned(), welcomed }
+            let reason = match status.message() {
+                "" | "transport error" => innermost(status),
+                message => message.to_owned(),
+            };
+            End::Lost { reason, welcomed }
         }
     }
 }

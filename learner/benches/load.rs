@@ -4,17 +4,21 @@
 //! `cargo bench -p popgym-learner` prints a table. The learner's side is a whole one but for learning: episodes are accepted,
 //! checked, written into `events.jsonl` and laid out as batches of 65,536 steps; after each the weights (GRU-256) go out to all.
 //! Its actors are tasks of one other process on the same cores. Time is that of the processor, in shares of one core: of the
-//! learner's network, of its batches, and of the actors. Without cargo's `--bench` (under `cargo test --all-targets`) it only
+//! learner's network, of its batches, and of the actors. Last, 500 actors are connected, and what the metrics port answers is
+//! timed. Without cargo's `--bench` (under `cargo test --all-targets`) it only
 //! runs for a moment.
 
-use std::net::{SocketAddr, TcpListener};
+use std::io::{Read as _, Write as _};
+use std::net::{SocketAddr, TcpListener, TcpStream};
 use std::process::{Child, Command};
+use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use anyhow::Context as _;
 use bytes::Bytes;
 use popgym_envs::{Observability, Purpose, Registry, VecEnv, stream};
 use popgym_learner::batch::Batch;
+use popgym_learner::page::{self, Board};
 use popgym_learner::service::{Entrance, Service, Target};
 use popgym_models::{Policy, PolicyOptions, PolicySpec, memory};
 use popgym_proto::{
@@ -22,7 +26,7 @@ use popgym_proto::{
     PROTOCOL_VERSION, RunSpec, transport,
 };
 use tch::Device;
-use tokio::sync::mpsc;
+use tokio::sync::{Semaphore, mpsc};
 use tokio_stream::wrappers::ReceiverStream;
 
 const ENV: &str = "RepeatPreviousEasy";
@@ -46,13 +50,42 @@ fn main() -> anyhow::Result<()> {
         "actors", "asked", "steps/s", "MB/s in", "network", "batches", "actors", "memory, MiB"
     );
     for (actors, rate) in if measures { &LOADS[..] } else { &LOADS[1..2] } {
-        measure(*actors, *rate, Duration::from_secs(if measures { 15 } else { 1 }))?;
+        measure(*actors, *rate, Duration::from_secs(if measures { 15 } else { 1 }), None)?;
     }
-    Ok(())
+    let monitor = TcpListener::bind("127.0.0.1:0")?.local_addr()?;
+    let board = Board::default();
+    popgym_proto::monitor::serve(monitor, page::router(board.clone())).map_err(anyhow::Error::msg)?;
+    let (actors, time) = if measures { (500, Duration::from_secs(15)) } else { (16, Duration::from_secs(1)) };
+    measure(actors, 20_000, time, Some((monitor, board)))
 }
 
-/// Serves `actors` actors for `time`, and prints a line.
-fn measure(actors: usize, rate: u64, time: Duration) -> anyhow::Result<()> {
+/// Asks for `path` every 50 ms until `time` is over, and prints how long the answers took and how large they were.
+fn scrape(address: SocketAddr, path: &str, time: Duration) -> anyhow::Result<String> {
+    let (began, mut seconds, mut bytes) = (Instant::now(), Vec::new(), 0);
+    while began.elapsed() < time {
+        let asked = Instant::now();
+        let mut stream = TcpStream::connect(address)?;
+        write!(stream, "GET {path} HTTP/1.1\r\nHost: {address}\r\nConnection: close\r\n\r\n")?;
+        let mut answer = Vec::new();
+        stream.read_to_end(&mut answer)?;
+        anyhow::ensure!(answer.starts_with(b"HTTP/1.1 200"), "{path}: {}", String::from_utf8_lossy(&answer));
+        seconds.push(asked.elapsed().as_secs_f64());
+        bytes = bytes.max(answer.len());
+        std::thread::sleep(Duration::from_millis(50));
+    }
+    seconds.sort_by(f64::total_cmp);
+    let ms = |share: f64| 1e3 * seconds[((seconds.len() - 1) as f64 * share) as usize];
+    Ok(format!(
+        "{path}: {} answers, median {:.1} ms, 99% within {:.1} ms, largest {:.0} KB",
+        seconds.len(),
+        ms(0.5),
+        ms(0.99),
+        bytes as f64 / 1e3
+    ))
+}
+
+/// Serves `actors` actors for `time`, and prints a line; and what a metrics port answers meanwhile, if there is one.
+fn measure(actors: usize, rate: u64, time: Duration, monitor: Option<(SocketAddr, Board)>) -> anyhow::Result<()> {
     let env = Registry::standard().get(ENV)?.observed(Observability::Partial)?;
     let memories = memory::Registry::standard();
     let spec = PolicySpec {
@@ -76,6 +109,10 @@ fn measure(actors: usize, rate: u64, time: Duration) -> anyhow::Result<()> {
         std::thread::sleep(Duration::from_millis(10));
     }
 
+    let scrapes = monitor.map(|(address, board)| {
+        board.set_roster(service.roster());
+        ["/metrics", "/run.json"].map(|path| std::thread::spawn(move || scrape(address, path, time)))
+    });
     let (mut steps, mut bytes, mut epoch, mut start) = (0, 0, 0, None);
     // The first epoch warms up.
     loop {
@@ -104,6 +141,9 @@ fn measure(actors: usize, rate: u64, time: Duration) -> anyhow::Result<()> {
             );
             break;
         }
+    }
+    for scrapes in scrapes.into_iter().flatten() {
+        println!("{}", scrapes.join().expect("no panic")?);
     }
     service.finish("measured");
     Ok(())
@@ -186,15 +226,19 @@ fn peak_memory_mib() -> f64 {
     line.and_then(|line| line.split_whitespace().next()?.parse::<f64>().ok()).map_or(f64::NAN, |kib| kib / 1024.0)
 }
 
+/// Actors that shake hands at a time: a learner has a limit of those from one address that have not yet said who they are.
+const NEWCOMERS: usize = 64;
+
 /// Runs `actors` actors until the learner stops them.
 fn act(address: SocketAddr, actors: usize, rate: u64) -> anyhow::Result<()> {
     let episode = recorded()?;
     let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build()?;
     runtime.block_on(async {
         let mut tasks = tokio::task::JoinSet::new();
+        let door = Arc::new(Semaphore::new(NEWCOMERS));
         for actor in 0..actors {
             let pace = (rate > 0).then(|| Duration::from_secs_f64(actors as f64 / rate as f64));
-            tasks.spawn(one_actor(address, actor, episode.clone(), pace));
+            tasks.spawn(one_actor(address, door.clone(), actor, episode.clone(), pace));
         }
         while let Some(ended) = tasks.join_next().await {
             ended??;
@@ -222,7 +266,14 @@ fn recorded() -> anyhow::Result<Episode> {
 }
 
 /// One session; `pace` is the time that a step takes.
-async fn one_actor(address: SocketAddr, number: usize, episode: Episode, pace: Option<Duration>) -> anyhow::Result<()> {
+async fn one_actor(
+    address: SocketAddr,
+    door: Arc<Semaphore>,
+    number: usize,
+    episode: Episode,
+    pace: Option<Duration>,
+) -> anyhow::Result<()> {
+    let mut entering = Some(door.acquire_owned().await?);
     let channel = transport::endpoint(&format!("http://{address}"))?.connect().await?;
     let (requests, stream) = mpsc::channel(4);
     let hello = Hello {
@@ -241,6 +292,7 @@ async fn one_actor(address: SocketAddr, number: usize, episode: Episode, pace: O
         let leases = match LearnerMessage::from_wire(message)? {
             LearnerMessage::Welcome(_) => {
                 requests.send(ActorMessage::Ready(FINGERPRINT).into_wire()).await?;
+                drop(entering.take());
                 continue;
             }
             LearnerMessage::Epoch(epoch) => {

@@ -97,6 +97,9 @@ pub struct StopFlags {
     /// After SIGTERM the run is saved and ends within as many seconds, 1 to 3600
     #[arg(long, value_name = "SECONDS", default_value_t = 30, value_parser = clap::value_parser!(u64).range(1..=3600))]
     pub grace: u64,
+    /// Exit status after SIGTERM while the run is not complete, 0 to 255: for schedulers to whom 0 is the end of the work
+    #[arg(long, value_name = "STATUS", default_value_t = 0)]
+    pub sigterm_status: u8,
 }
 
 impl StopFlags {

@@ -18,6 +18,7 @@ pub struct Interrupt {
     requested: Arc<AtomicBool>,
     /// Whether it was SIGTERM; set before the other.
     terminated: Arc<AtomicBool>,
+    sigterm_status: u8,
 }
 
 impl Interrupt {
@@ -28,7 +29,7 @@ impl Interrupt {
     /// The signals cannot be listened for.
     pub fn listen(grace: Option<Duration>) -> anyhow::Result<Self> {
         let interrupt = Self::default();
-        let Self { requested, terminated } = interrupt.clone();
+        let Self { requested, terminated, .. } = interrupt.clone();
         let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
         let (mut ctrl_c, mut terminate) = {
             let _guard = runtime.enter();
@@ -76,9 +77,15 @@ impl Interrupt {
         Ok(())
     }
 
-    /// With which status a run ends that was asked to: whoever sends SIGTERM expects 0.
+    /// A run that SIGTERM has ended then ends with `status`, not 0.
+    #[must_use]
+    pub fn with_sigterm_status(self, status: u8) -> Self {
+        Self { sigterm_status: status, ..self }
+    }
+
+    /// With which status a run ends that was asked to.
     pub fn exit_status(&self) -> u8 {
-        if self.terminated.load(Ordering::SeqCst) { 0 } else { EXIT_INTERRUPTED }
+        if self.terminated.load(Ordering::SeqCst) { self.sigterm_status } else { EXIT_INTERRUPTED }
     }
 
     /// Whether a signal has come.

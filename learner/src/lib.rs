@@ -16,6 +16,7 @@
 //! | [`statistics`] | means, quantiles, intervals, rank correlation |
 //! | `screen` | environments on a terminal and as animated images: what `play` and `watch` show |
 //! | [`baseline`], [`space_text`] | what acting at random scores; spaces in words |
+//! | [`page`] | the run in a browser, on the metrics port |
 //! | [`observer`] | what a run tells: files, progress bar, TensorBoard, Prometheus |
 //!
 //! A user's own `main` adds environments, memories and observers to [`Extensions`] and calls [`run`].
@@ -37,6 +38,7 @@ pub mod loss;
 pub mod manifest;
 pub mod minibatches;
 pub mod observer;
+pub mod page;
 pub mod ppo_keys;
 pub mod report;
 pub mod run_dir;

@@ -89,6 +89,10 @@ impl ActorCommand {
         command.args(&self.args).arg("--with-parent").stdin(Stdio::piped()).stdout(Stdio::null());
         // Ctrl-C in a terminal goes to its whole process group. It is the learner that decides what it means.
         command.process_group(0);
+        // What is meant for actors of another learner.
+        for (name, _) in std::env::vars_os().filter(|(name, _)| name.as_encoded_bytes().starts_with(b"POPGYM_")) {
+            command.env_remove(name);
+        }
         if std::env::var_os("RUST_LOG").is_none() {
             // They share the learner's terminal, and its log says who joined.
             command.env("RUST_LOG", "warn");

@@ -8,13 +8,14 @@ use anyhow::Context;
 use popgym_envs::{EnvSpec, Purpose, Space, stream};
 use popgym_models::{Policy, PolicySpec, memory};
 use popgym_proto::transport::metrics_address;
-use popgym_proto::{EpisodeSpec, fingerprint};
+use popgym_proto::{EpisodeSpec, fingerprint, monitor};
 use rand::Rng as _;
 use tch::Device;
 
 use crate::Extensions;
 use crate::config::{self, Config, ServiceConfig};
 use crate::local_actors::{ActorCommand, Hopeless, LocalActors};
+use crate::page::{self, Board};
 use crate::service::{Entrance, Service};
 
 /// One learner at work, with its actors.
@@ -33,6 +34,8 @@ pub struct Session<'a> {
     actor_command: Vec<String>,
     /// The first is for remote actors; the second, if there is one, for local ones.
     entrances: Vec<Entrance>,
+    /// What the page on the metrics port shows.
+    board: Board,
     service: Option<Service>,
     actors: Option<LocalActors>,
 }
@@ -59,6 +62,7 @@ impl<'a> Session<'a> {
             stored_action: policy.distribution().stored_space(),
             actor_command: extensions.actor_command.clone(),
             entrances: Vec::new(),
+            board: Board::default(),
             service: None,
             actors: None,
         })
@@ -121,7 +125,7 @@ impl<'a> Session<'a> {
             // Local actors need no certificate, and the learner's need not be for this machine's own address.
             self.entrances.push(Entrance { listener: bind("127.0.0.1:0")?, tls: None });
         }
-        if service.metrics_listen.is_empty() { Ok(()) } else { serve_metrics(&service.metrics_listen) }
+        if service.metrics_listen.is_empty() { Ok(()) } else { self.monitor(&service.metrics_listen) }
     }
 
     /// Starts serving actors of the run called `run`, and starts the local ones. What happens is written to `account`.
@@ -142,7 +146,9 @@ impl<'a> Session<'a> {
         };
         let fingerprint = fingerprint(&spec, &format!("{:?}", self.env), &self.signature);
         let service = &self.config.service;
-        self.service = Some(Service::start(entrances, service.token(), account, spec, episodes, fingerprint)?);
+        let started = Service::start(entrances, service.token(), account, spec, episodes, fingerprint)?;
+        self.board.set_roster(started.roster());
+        self.service = Some(started);
         if service.actors > 0 {
             let mut args = vec![
                 "--learner".to_owned(),
@@ -164,6 +170,20 @@ impl<'a> Session<'a> {
             let scheme = if service.tls().is_some() { "https" } else { "http" };
             tracing::info!("waiting for actors: actor --learner {scheme}://{local}");
         }
+        Ok(())
+    }
+
+    /// What the page on the metrics port shows; an observer of the run.
+    pub fn board(&self) -> Board {
+        self.board.clone()
+    }
+
+    fn monitor(&self, address: &str) -> anyhow::Result<()> {
+        let address = metrics_address(address).map_err(anyhow::Error::msg)?;
+        self.board.set_config(self.config.to_toml()?);
+        monitor::serve(address, page::router(self.board())).map_err(anyhow::Error::msg)?;
+        crate::observer::Prometheus::describe();
+        tracing::info!("the run's page: http://{address}/");
         Ok(())
     }
 
@@ -214,15 +234,5 @@ fn check_exposure(entrance: &Entrance, service: &ServiceConfig) -> anyhow::Resul
     tracing::warn!(
         "listening on {address} without TLS or without a token: whoever reaches it can read and change this run"
     );
-    Ok(())
-}
-
-fn serve_metrics(address: &str) -> anyhow::Result<()> {
-    let address = metrics_address(address).map_err(anyhow::Error::msg)?;
-    metrics_exporter_prometheus::PrometheusBuilder::new()
-        .with_http_listener(address)
-        .install()
-        .with_context(|| format!("cannot serve metrics on {address}"))?;
-    crate::observer::Prometheus::describe();
     Ok(())
 }

@@ -9,10 +9,11 @@ use std::time::Instant;
 
 use anyhow::Context;
 use bytes::Bytes;
+use metrics::{counter, gauge};
 use popgym_envs::space::Space;
 use popgym_envs::{Purpose, stream};
 use popgym_models::Policy;
-use popgym_proto::Episode;
+use popgym_proto::{Episode, monitor};
 
 use crate::adam::{Adam, AdamOptions, AdamState};
 use crate::batch::Batch;
@@ -65,6 +66,22 @@ struct State {
     earlier_seconds: f64,
 }
 
+/// Where the time of an epoch goes.
+struct Laps(Instant);
+
+impl Laps {
+    fn begin() -> Self {
+        Self(Instant::now())
+    }
+
+    /// What went by since the last lap's end went to `activity`.
+    fn end(&mut self, activity: &'static str) {
+        let began = std::mem::replace(&mut self.0, Instant::now());
+        let seconds = (self.0 - began).as_secs_f64();
+        gauge!("popgym_learner_activity_seconds_total", "activity" => activity).increment(seconds);
+    }
+}
+
 impl Trainer<'_> {
     /// Runs epochs until the run's end, an interrupt, or a divergence; leaves a checkpoint in each case.
     ///
@@ -82,6 +99,8 @@ impl Trainer<'_> {
                 Ok(false) => break "interrupt",
                 Err(error) => {
                     let _ = self.save(&mut state);
+                    // What went wrong is in the metrics.
+                    monitor::wait_for_scrape();
                     return Err(error);
                 }
             }
@@ -149,6 +168,7 @@ impl Trainer<'_> {
     /// One epoch. False: interrupted, and the state is that before the epoch.
     fn epoch(&mut self, state: &mut State) -> anyhow::Result<bool> {
         let began = Instant::now();
+        let mut laps = Laps::begin();
         let stop = || self.interrupt.requested() || self.hopeless.is_set();
         let Some(collected) = self.service.collect(stop) else {
             anyhow::ensure!(!self.hopeless.is_set(), "local actors fail again and again; see their messages above");
@@ -156,6 +176,7 @@ impl Trainer<'_> {
             return Ok(false);
         };
         let wait_seconds = began.elapsed().as_secs_f64();
+        laps.end("waiting");
         let epoch = state.progress.epoch;
         let before = state.progress.clone();
         account(&mut state.progress, &collected.episodes);
@@ -170,6 +191,7 @@ impl Trainer<'_> {
         // EVALUATE: by the version that sampled the epoch.
         let learning = Instant::now();
         let batch = Batch::new(&collected.episodes, &self.action, &self.policy);
+        laps.end("batching");
         let old = batch.evaluate(&self.behaviour, &self.config.ppo);
         if pipelined {
             self.behaviour.load(&newest)?;
@@ -189,10 +211,15 @@ impl Trainer<'_> {
             Ok(means) => means,
             Err(error) => {
                 state.progress = before;
+                if let UpdateError::NotFinite { .. } = error {
+                    counter!("popgym_learner_nonfinite_updates_total").increment(1);
+                }
                 return if error == UpdateError::Interrupted { Ok(false) } else { Err(error.into()) };
             }
         };
         let learn_seconds = learning.elapsed().as_secs_f64();
+        counter!("popgym_learner_passes_total").increment(u64::from(self.config.ppo.passes));
+        laps.end("learning");
 
         // BROADCAST
         let weights = Bytes::from(self.policy.to_bytes());
@@ -209,6 +236,7 @@ impl Trainer<'_> {
                 self.open_epoch(epoch + 1, epoch + 1, sampling.clone())?;
             }
         }
+        laps.end("broadcasting");
         state.snapshot = Checkpoint { progress: state.progress.clone(), weights, sampling, optimizer };
 
         // REPORT AND SAVE: the row of metrics first, so that a checkpoint never stands without it.
@@ -229,10 +257,12 @@ impl Trainer<'_> {
         };
         let report = EpochReport { metrics, timing };
         self.tell(|observer| observer.epoch(&report));
+        laps.end("reporting");
         fail_point::reached("an epoch reported and not saved");
         if state.progress.epoch.is_multiple_of(self.config.checkpoint_epochs) {
             let _ = self.save(state);
         }
+        laps.end("checkpointing");
         Ok(true)
     }
 
@@ -267,7 +297,7 @@ impl Trainer<'_> {
                 true
             }
             Err(error) => {
-                metrics::counter!("popgym_learner_checkpoint_failures_total").increment(1);
+                counter!("popgym_learner_checkpoint_failures_total").increment(1);
                 tracing::error!("checkpoint of epoch {epoch} not written: {error:#}");
                 false
             }

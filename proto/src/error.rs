@@ -96,7 +96,10 @@ where
 
 /// Checks a name: `min..=128` characters, all of them visible wherever they are shown: no white space, nothing that controls a
 /// terminal or turns the direction of a line.
-pub(crate) fn name(field: &'static str, value: String, min: usize) -> Result<String, WireError> {
+///
+/// # Errors
+/// What is wrong with it, as that of the field `field`.
+pub fn name(field: &'static str, value: String, min: usize) -> Result<String, WireError> {
     let chars = value.chars().count();
     if !(min..=crate::limits::MAX_NAME_CHARS).contains(&chars) {
         let allowed = format!("{min}..={} characters", crate::limits::MAX_NAME_CHARS);

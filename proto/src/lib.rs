@@ -6,6 +6,7 @@
 //! | [`message`] | the two directions of a session: [`ActorMessage`], [`LearnerMessage`] |
 //! | [`run`] | [`RunSpec`], [`Hello`], and the fingerprint by which both sides know that they build the same policy |
 //! | [`episode`] | [`Episode`], checked against an [`EpisodeSpec`]; [`EpisodeBuilder`] for who samples it |
+//! | [`monitor`] | the HTTP port of both programs: metrics, health |
 //! | [`token`] | the secret that actors show |
 //! | [`transport`] | channel and server settings, the same care on both sides |
 //! | [`wire`] | the generated code; nothing outside this crate reads its fields |
@@ -17,6 +18,7 @@ pub mod episode;
 pub mod error;
 pub mod limits;
 pub mod message;
+pub mod monitor;
 pub mod run;
 pub mod token;
 pub mod transport;

@@ -73,8 +73,8 @@ pub const MAX_CONNECTIONS: usize = 2 * MAX_SESSIONS;
 /// [`READY_DEADLINE`] where they have said a legal hello.
 pub const MAX_STRANGERS: usize = 256;
 
-/// Connections and requests of one address. An actor takes two to connect: all of [`MAX_SESSIONS`] may be behind one
-/// address, and come back twice in a few minutes.
+/// Connections of one address, and requests beyond the first of each. All of [`MAX_SESSIONS`] may be behind one address, and
+/// come back four times in a few minutes.
 pub const ATTEMPTS: Rate = Rate { burst: 4 * MAX_SESSIONS as u32, per_second: 4 };
 
 /// What a session that broke a rule costs of its address's [`ATTEMPTS`]. No honest actor ever does, so this is for liars:
@@ -93,6 +93,12 @@ pub const HEARTBEATS: Rate = Rate { burst: 16, per_second: 1 };
 /// heartbeats there are some 100.
 pub const OVERHEAD_BYTES: usize = 16 << 10;
 
+/// Connections to a metrics port at a time; more wait. Prometheus has one, a browser six.
+pub const MONITOR_CONNECTIONS: usize = 64;
+
+/// A connection to a metrics port is closed after this long, whatever it does; the next request makes a new one.
+pub const MONITOR_CONNECTION_AGE: Duration = Duration::from_mins(5);
+
 /// A peer whose TLS handshake takes longer is dropped.
 pub const TLS_DEADLINE: Duration = Duration::from_secs(5);
 
@@ -108,8 +114,15 @@ pub const READY_DEADLINE: Duration = Duration::from_mins(2);
 /// Each side sends something at least this often.
 pub const HEARTBEAT_INTERVAL: Duration = Duration::from_secs(5);
 
-/// A peer that sent nothing for this long is gone: four heartbeats.
+/// A peer that sent nothing for this long is gone: four heartbeats. So is one that takes nothing of what it is sent.
 pub const SILENCE_LIMIT: Duration = Duration::from_secs(20);
+
+/// A peer that sends, or takes, as many bytes within [`SILENCE_LIMIT`] is not gone, but slow: a long message is on its way.
+pub const SLOWEST_BYTES: u64 = 64 << 10;
+
+/// An actor waits as long for the learner's next message, of up to [`MAX_MESSAGE_BYTES`], while the network is alive
+/// ([`KEEPALIVE_TIMEOUT`]): weights of 20 MB for 256 actors take 41 s of 1 Gbit/s.
+pub const MESSAGE_DEADLINE: Duration = Duration::from_mins(5);
 
 /// An actor that holds leases and has sent nothing for this long, and for [`LEASE_PATIENCE_FACTOR`] times as long as others of
 /// the epoch took for all of theirs, keeps idle actors waiting: they get its leases. Each time within an epoch, it takes twice
@@ -137,6 +150,10 @@ pub const CLOSE_DEADLINE: Duration = Duration::from_millis(500);
 /// One session a connection, so both are equal. A window of 16 MiB keeps a 1 Gbit/s link with 100 ms round trip full
 /// (12.5 MB in flight), and holds any usual weights message whole.
 pub const WINDOW_BYTES: u32 = 16 << 20;
+
+/// Largest HTTP/2 frame that an actor takes: weights travel in few of them, not in hundreds of 16 KiB each. One that takes
+/// longer than [`KEEPALIVE_INTERVAL`] and [`KEEPALIVE_TIMEOUT`] to come would end the connection: 13 KB/s is enough.
+pub const FRAME_BYTES: u32 = 256 << 10;
 
 /// Most concurrent streams of a connection: a session, health checks, and some to spare.
 pub const MAX_STREAMS_PER_CONNECTION: u32 = 8;

@@ -14,6 +14,7 @@ use popgym_proto::{
     ActorMessage, Fingerprint, Hello, LearnerMessage, Leases, OpenEpoch, PROTOCOL_VERSION, RunSpec, transport, wire,
 };
 use prost::Message as _;
+use socket2::SockRef;
 use tokio::io::Interest;
 use tokio::net::{TcpSocket, TcpStream};
 use tokio::sync::{mpsc, oneshot, watch};
@@ -33,6 +34,32 @@ pub async fn connect(address: SocketAddr, from: Ipv4Addr) -> io::Result<TcpStrea
     let socket = TcpSocket::new_v4()?;
     socket.bind((from, 0).into())?;
     socket.connect(address).await
+}
+
+/// Connects, asks for more answers than there is room for on the way, and reads none of them.
+///
+/// # Errors
+/// The system refuses the socket, or its options.
+pub async fn deaf(address: SocketAddr, from: Ipv4Addr) -> io::Result<TcpStream> {
+    let socket = TcpSocket::new_v4()?;
+    // With both, the learner's own side of the connection is small too.
+    socket.set_recv_buffer_size(1)?;
+    SockRef::from(&socket).set_tcp_mss(100)?;
+    socket.bind((from, 0).into())?;
+    let stream = socket.connect(address).await?;
+    let pings = [PREFACE, &frame(6, 0, 0, &[7; 8]).repeat(3700)].concat();
+    let mut sent = 0;
+    while sent < pings.len() {
+        // The learner takes no more while it cannot answer.
+        let Ok(writable) = tokio::time::timeout(Duration::from_secs(1), stream.writable()).await else { break };
+        writable?;
+        match stream.try_write(&pings[sent..]) {
+            Ok(written) => sent += written,
+            Err(error) if error.kind() == io::ErrorKind::WouldBlock => {}
+            Err(error) => return Err(error),
+        }
+    }
+    Ok(stream)
 }
 
 /// A connection of HTTP/2; it ends with this value.

@@ -10,6 +10,10 @@
 //! | [`authority`] | certificates |
 //! | [`attacked`] | a run with an actor that works, and those who attack it |
 //! | [`hostile`] | a client that lies |
+//! | [`kustomize`] | manifests for Kubernetes, rendered |
+//! | [`schemas`] | whether they are valid |
+//! | [`manifests`] | the jobs in them |
+//! | [`monitoring`] | dashboards, rules, the list of metrics |
 //! | [`net`] | a free port, a plain HTTP request, the health service |
 //!
 //! Every wait has the same generous deadline: it only tells a test that hangs from one on a busy machine.
@@ -21,9 +25,13 @@ pub mod account;
 pub mod attacked;
 pub mod authority;
 pub mod hostile;
+pub mod kustomize;
+pub mod manifests;
+pub mod monitoring;
 pub mod net;
 pub mod process;
 pub mod scene;
+pub mod schemas;
 pub mod terminal;
 
 pub use account::Account;

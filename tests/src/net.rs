@@ -41,7 +41,11 @@ pub fn counter(metrics: &str, name: &str) -> u64 {
     value.unwrap_or(0)
 }
 
-fn request(address: &str, path: &str) -> io::Result<String> {
+/// All that is answered to `GET path` at `address`.
+///
+/// # Errors
+/// The address is not served, or not in time.
+pub fn request(address: &str, path: &str) -> io::Result<String> {
     let mut stream = TcpStream::connect(address)?;
     stream.set_read_timeout(Some(DEADLINE))?;
     write!(stream, "GET {path} HTTP/1.1\r\nHost: {address}\r\nConnection: close\r\n\r\n")?;

@@ -1,5 +1,6 @@
 //! One `learner` or `actor` process.
 
+use std::ffi::OsString;
 use std::fmt::Write as _;
 use std::fs::{self, File};
 use std::os::unix::process::ExitStatusExt as _;
@@ -12,17 +13,7 @@ use tempfile::TempDir;
 use crate::until;
 
 /// Variables of whoever runs the tests that would change what the programs do.
-const FOREIGN: [&str; 9] = [
-    "GOMP_SPINCOUNT",
-    "MKL_DYNAMIC",
-    "OMP_WAIT_POLICY",
-    "POPGYM_ACTOR_METRICS_LISTEN",
-    "POPGYM_ACTOR_NAME",
-    "POPGYM_LEARNER",
-    "POPGYM_RETRY_SECONDS",
-    "POPGYM_RUN",
-    "RUST_LOG",
-];
+const FOREIGN: [&str; 4] = ["GOMP_SPINCOUNT", "MKL_DYNAMIC", "OMP_WAIT_POLICY", "RUST_LOG"];
 
 /// One of the workspace's binaries.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -56,7 +47,9 @@ impl Program {
     /// A command that starts it, with nothing to read.
     pub fn command(self) -> Command {
         let mut command = Command::new(self.path());
-        for name in FOREIGN {
+        let ours = std::env::vars_os().map(|(name, _)| name);
+        let ours = ours.filter(|name| name.as_encoded_bytes().starts_with(b"POPGYM_"));
+        for name in ours.chain(FOREIGN.map(OsString::from)) {
             command.env_remove(name);
         }
         command.stdin(Stdio::null());

@@ -184,8 +184,12 @@ fn prometheus_watches_both_sides() {
         "weights_version ",
         "return_mean ",
         "collect_seconds",
-        "wait_seconds",
-        "learn_seconds",
+        "activity_seconds_total{activity=\"waiting\"} ",
+        "activity_seconds_total{activity=\"learning\"} ",
+        "passes_total ",
+        "checkpoint_timestamp_seconds ",
+        "disk_free_bytes ",
+        "steps_accepted_total ",
         "event_queue ",
         "received_bytes_total ",
         "sent_bytes_total ",
@@ -199,6 +203,8 @@ fn prometheus_watches_both_sides() {
     let text = net::get(&actor_metrics, "/metrics", &names.each_ref().map(String::as_str));
     let activities = text.matches("\npopgym_actor_activity_seconds_total{activity=").count();
     assert!(activities >= 3, "where time goes: {text}");
+    assert!(text.contains("# TYPE popgym_actor_activity_seconds_total counter"));
+    assert!(text.contains("\nprocess_resident_memory_bytes "));
     assert!(learner.is_running() && actor.is_running());
 }
 

@@ -25,7 +25,7 @@ use crate::trainer::Trainer;
 /// Bad configuration; a directory that cannot be used; a run that failed.
 pub fn train(args: &TrainArgs, extensions: Extensions) -> Outcome {
     let config = configure(args, &extensions).map_err(Failure::Usage)?;
-    let interrupt = Interrupt::listen(Some(args.stop.grace()))?;
+    let interrupt = Interrupt::listen(Some(args.stop.grace()))?.with_sigterm_status(args.stop.sigterm_status);
     if args.with_parent {
         interrupt.with_parent()?;
     }
@@ -62,7 +62,8 @@ pub fn resume(args: &ResumeArgs, extensions: Extensions) -> Outcome {
     let mut config = load(&flags).map_err(Failure::Usage)?;
     resolve_device(&mut config).map_err(Failure::Usage)?;
     let session = Session::new(&config, &extensions)?;
-    carry_out(&dir, session, &config, extensions, &Interrupt::listen(Some(args.stop.grace()))?)
+    let interrupt = Interrupt::listen(Some(args.stop.grace()))?.with_sigterm_status(args.stop.sigterm_status);
+    carry_out(&dir, session, &config, extensions, &interrupt)
 }
 
 fn configure(args: &TrainArgs, extensions: &Extensions) -> anyhow::Result<Config> {
@@ -117,7 +118,9 @@ fn carry_out(
     // What was asked for now is what the directory says from now on.
     files::write(&RunDir::config_path(dir.path()), &config.to_toml()?)?;
     let (policy, behaviour) = (session.first_policy()?, session.policy()?);
-    let observers = observers(dir, config, checkpoint.as_ref(), extensions.observers)?;
+    let mut users = extensions.observers;
+    users.push(Box::new(session.board()));
+    let observers = observers(dir, config, checkpoint.as_ref(), users)?;
     session.serve(dir.run(), Purpose::Training, Some(&dir.path().join("events.jsonl")))?;
     let trainer = Trainer {
         config,

@@ -1,20 +1,24 @@
 //! The run as Prometheus metrics, through the `metrics` crate; an exporter is the business of `main`.
 
+use std::path::{Path, PathBuf};
+use std::time::{SystemTime, UNIX_EPOCH};
+
+use anyhow::Context as _;
 use metrics::{Unit, counter, describe_counter, describe_gauge, describe_histogram, gauge, histogram};
 
 use super::{EpochReport, Observer, RunStart};
 
 /// Sets the metrics `popgym_learner_...` after every epoch.
-///
-/// Seconds are histograms, because counters of the `metrics` crate are whole numbers: the rate of their `_sum` shows
-/// where the time goes.
 #[derive(Default)]
-pub struct Prometheus;
+pub struct Prometheus {
+    /// The run directory.
+    dir: PathBuf,
+}
 
 impl Prometheus {
     /// The observer; it records wherever the `metrics` crate's recorder is at the time.
     pub fn new() -> Self {
-        Self
+        Self::default()
     }
 
     /// Tells the recorder the meaning and unit of each metric; once, after the recorder is installed.
@@ -22,11 +26,23 @@ impl Prometheus {
         describe_gauge!("popgym_learner_run_info", "What is trained, in labels; always 1.");
         describe_gauge!("popgym_learner_target_steps", Unit::Count, "Environment steps after which the run stops.");
         describe_counter!("popgym_learner_epochs_total", Unit::Count, "Epochs completed.");
+        describe_counter!("popgym_learner_passes_total", Unit::Count, "Passes over a batch, this session.");
+        describe_counter!(
+            "popgym_learner_nonfinite_updates_total",
+            Unit::Count,
+            "Updates that diverged; the run ends with the first."
+        );
         describe_counter!(
             "popgym_learner_checkpoint_failures_total",
             Unit::Count,
             "Checkpoints that could not be written."
         );
+        describe_gauge!(
+            "popgym_learner_checkpoint_timestamp_seconds",
+            Unit::Seconds,
+            "When the last checkpoint was written, or, before the first, this session began; since 1970."
+        );
+        describe_gauge!("popgym_learner_disk_free_bytes", Unit::Bytes, "Free space where the run directory is.");
         describe_gauge!("popgym_learner_weights_version", Unit::Count, "Epochs of training in the newest weights.");
         describe_counter!("popgym_learner_env_steps_total", Unit::Count, "Environment steps of completed epochs.");
         describe_counter!("popgym_learner_episodes_total", Unit::Count, "Episodes of completed epochs.");
@@ -49,19 +65,25 @@ impl Prometheus {
         describe_gauge!("popgym_learner_wall_seconds", Unit::Seconds, "Age of the run, earlier sessions included.");
         let seconds = |name, meaning| describe_histogram!(name, Unit::Seconds, meaning);
         seconds("popgym_learner_collect_seconds", "From the opening of an epoch's sampling to its completion.");
-        seconds("popgym_learner_wait_seconds", "Time in an epoch that the learner only waited for episodes.");
-        seconds("popgym_learner_learn_seconds", "Time of an epoch's update.");
-        seconds("popgym_learner_other_seconds", "Time of an epoch's encoding, checkpoint and files.");
+        describe_gauge!(
+            "popgym_learner_activity_seconds_total",
+            Unit::Seconds,
+            "Seconds of the learner's thread by activity: waiting (for episodes), batching, learning, broadcasting, \
+             reporting, checkpointing."
+        );
         describe_gauge!(
             "popgym_learner_log_prob_difference",
             "Largest difference of log-probabilities between actors and learner; not small: a wrong actor build."
         );
-        describe_gauge!("popgym_learner_actors", Unit::Count, "Actors connected at the end of the last epoch.");
     }
 }
 
 impl Observer for Prometheus {
     fn run_start(&mut self, start: &RunStart) -> anyhow::Result<()> {
+        self.dir.clone_from(&start.dir);
+        checkpointed();
+        counter!("popgym_learner_nonfinite_updates_total").increment(0);
+        counter!("popgym_learner_checkpoint_failures_total").increment(0);
         gauge!(
             "popgym_learner_run_info",
             "env" => start.env.clone(),
@@ -103,19 +125,25 @@ impl Observer for Prometheus {
         gauge!("popgym_learner_steps_per_second").set(timing.steps_per_second);
         gauge!("popgym_learner_wall_seconds").set(timing.wall_seconds);
         histogram!("popgym_learner_collect_seconds").record(timing.collect_seconds);
-        histogram!("popgym_learner_wait_seconds").record(timing.wait_seconds);
-        histogram!("popgym_learner_learn_seconds").record(timing.learn_seconds);
-        histogram!("popgym_learner_other_seconds").record(timing.other_seconds);
         gauge!("popgym_learner_log_prob_difference").set(timing.log_prob_difference);
-        gauge!("popgym_learner_actors").set(timing.actors as f64);
+        let disk = rustix::fs::statvfs(&self.dir).with_context(|| format!("the disk of {}", self.dir.display()))?;
+        gauge!("popgym_learner_disk_free_bytes").set(disk.f_bavail as f64 * disk.f_frsize as f64);
+        Ok(())
+    }
+
+    fn checkpoint(&mut self, _epoch: u64, _path: &Path) -> anyhow::Result<()> {
+        checkpointed();
         Ok(())
     }
 }
 
+fn checkpointed() {
+    let now = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
+    gauge!("popgym_learner_checkpoint_timestamp_seconds").set(now.as_secs_f64());
+}
+
 #[cfg(test)]
 mod tests {
-    use std::path::Path;
-
     use metrics_exporter_prometheus::PrometheusBuilder;
 
     use super::super::samples::{report, start};
@@ -127,7 +155,7 @@ mod tests {
         metrics::with_local_recorder(&recorder, || {
             Prometheus::describe();
             let mut observer = Prometheus::new();
-            observer.run_start(&start(Path::new("run"), 3)).unwrap();
+            observer.run_start(&start(Path::new("/"), 3)).unwrap();
             observer.epoch(&report(3)).unwrap();
             observer.epoch(&report(4)).unwrap();
         });
@@ -152,10 +180,6 @@ mod tests {
             "popgym_learner_policy_loss 0.01",
             "popgym_learner_steps_per_second 500",
             "popgym_learner_collect_seconds_sum 3",
-            "popgym_learner_wait_seconds_sum 0.5",
-            "popgym_learner_learn_seconds_sum 0.75",
-            "popgym_learner_learn_seconds_count 2",
-            "popgym_learner_actors 4",
         ] {
             assert!(text.lines().any(|candidate| candidate == line), "no line `{line}` in\n{text}");
         }

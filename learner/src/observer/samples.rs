@@ -5,7 +5,7 @@ use std::path::Path;
 use super::{EpochMetrics, EpochReport, EpochTiming, RunStart, Summary};
 
 /// A run of 10,000 steps in `dir` that has completed `epoch` epochs.
-pub(super) fn start(dir: &Path, epoch: u64) -> RunStart {
+pub(crate) fn start(dir: &Path, epoch: u64) -> RunStart {
     RunStart {
         dir: dir.to_owned(),
         env: "RepeatPreviousEasy".into(),

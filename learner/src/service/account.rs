@@ -14,15 +14,15 @@ use tracing::warn;
 use super::Target;
 use super::metrics;
 
-/// A file that has grown beyond this many bytes becomes `events.1.jsonl`, in place of the one before. A line is some 100 bytes, and
-/// there are a few for each message of an actor: hours of work.
+/// A file that has grown beyond this many bytes becomes `events.1.jsonl`, in place of the one before, when the next epoch opens. A
+/// line is some 100 bytes, and there are a few for each message of an actor: hours of work.
 const LARGEST_FILE: u64 = 256 << 20;
 
 /// What happened. Episodes are given as ranges of their numbers, `[first, last]`.
 #[derive(Debug, Serialize)]
 #[serde(tag = "event", rename_all = "snake_case")]
 pub(super) enum Entry<'a> {
-    /// A learner began to serve this run; what an epoch had before that is not closed is void.
+    /// A learner began to serve this run, or a file; what an epoch had before that is not closed is void.
     Started { run: &'a str, build: &'a str, lag: u32 },
     /// An epoch can be sampled, with the weights of `version`. What came for it before is void.
     Opened { epoch: u64, version: u64, target: Target },
@@ -51,26 +51,45 @@ struct Line<'a> {
 
 /// Writes the account, or nothing where there is none to write.
 #[derive(Debug, Default)]
-pub(super) struct Account(Option<Open>);
+pub(super) struct Account {
+    /// `None`: the disk is full.
+    open: Option<Open>,
+    /// Where it is, and of which run with which lag. `None`: there is none to write.
+    about: Option<(PathBuf, String, u32)>,
+}
 
 #[derive(Debug)]
 struct Open {
-    path: PathBuf,
     file: BufWriter<File>,
     bytes: u64,
 }
 
 impl Account {
-    /// Continues the account in `path`. A line that was torn when a learner died is taken away.
-    pub(super) fn open(path: &Path) -> anyhow::Result<Self> {
-        let open = || -> std::io::Result<Open> {
-            let mut file = OpenOptions::new().read(true).write(true).create(true).truncate(false).open(path)?;
-            let bytes = whole_lines(&mut file)?;
-            file.set_len(bytes)?;
-            file.seek(SeekFrom::End(0))?;
-            Ok(Open { path: path.to_owned(), file: BufWriter::new(file), bytes })
-        };
-        Ok(Self(Some(open().with_context(|| format!("cannot write {}", path.display()))?)))
+    /// Continues the account in `path`, of a run and its lag.
+    pub(super) fn open(path: &Path, run: &str, lag: u32) -> anyhow::Result<Self> {
+        let open = Open::resume(path).with_context(|| format!("cannot write {}", path.display()))?;
+        let mut account = Self { open: Some(open), about: Some((path.to_owned(), run.to_owned(), lag)) };
+        account.start();
+        Ok(account)
+    }
+
+    fn start(&mut self) {
+        if let Some((_, run, lag)) = self.about.clone() {
+            self.write(Entry::Started { run: &run, build: env!("CARGO_PKG_VERSION"), lag });
+        }
+    }
+
+    /// Between two epochs: begins a new file where this one is large, and goes on where the disk was full. True if it did:
+    /// then what is the case has to be told anew, so that each file can be understood by itself.
+    pub(super) fn turn_page(&mut self) -> bool {
+        let Some((path, ..)) = self.about.clone() else { return false };
+        match &self.open {
+            Some(open) if open.bytes < LARGEST_FILE => return false,
+            Some(_) => self.attempt(|open| open.begin_anew(&path)),
+            None => self.open = Open::resume(&path).ok(),
+        }
+        self.start();
+        self.open.is_some()
     }
 
     /// Writes a line, soon.
@@ -79,9 +98,6 @@ impl Account {
             let time = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or(Duration::ZERO).as_secs_f64();
             let mut line = serde_json::to_vec(&Line { time, entry })?;
             line.push(b'\n');
-            if open.bytes >= LARGEST_FILE {
-                open.begin_anew()?;
-            }
             open.bytes += line.len() as u64;
             open.file.write_all(&line)
         });
@@ -92,23 +108,33 @@ impl Account {
         self.attempt(|open| open.file.flush());
     }
 
-    /// A full disk costs the rest of the account, not the run.
+    /// A full disk costs some of the account, not the run.
     fn attempt(&mut self, action: impl FnOnce(&mut Open) -> std::io::Result<()>) {
-        if let Some(open) = &mut self.0
+        if let Some(open) = &mut self.open
             && let Err(error) = action(open)
         {
-            warn!("{} ends here: {error}", open.path.display());
+            let path = self.about.as_ref().map_or(Path::new(""), |(path, ..)| path);
+            warn!("{} has a gap from here on: {error}", path.display());
             metrics::account_failed();
-            self.0 = None;
+            self.open = None;
         }
     }
 }
 
 impl Open {
-    fn begin_anew(&mut self) -> std::io::Result<()> {
+    /// Continues a file. A line that was torn when a learner died is taken away.
+    fn resume(path: &Path) -> std::io::Result<Self> {
+        let mut file = OpenOptions::new().read(true).write(true).create(true).truncate(false).open(path)?;
+        let bytes = whole_lines(&mut file)?;
+        file.set_len(bytes)?;
+        file.seek(SeekFrom::End(0))?;
+        Ok(Self { file: BufWriter::new(file), bytes })
+    }
+
+    fn begin_anew(&mut self, path: &Path) -> std::io::Result<()> {
         self.file.flush()?;
-        std::fs::rename(&self.path, self.path.with_extension("1.jsonl"))?;
-        self.file = BufWriter::new(File::create(&self.path)?);
+        std::fs::rename(path, path.with_extension("1.jsonl"))?;
+        self.file = BufWriter::new(File::create(path)?);
         self.bytes = 0;
         Ok(())
     }
@@ -165,26 +191,53 @@ mod tests {
                 if kept == 1 && !before.ends_with('\n') { "x".repeat(200_000) } else { String::new() }
             );
             std::fs::write(&path, torn).unwrap();
-            let mut account = Account::open(&path).unwrap();
+            let mut account = Account::open(&path, "run", 0).unwrap();
             account.write(finished("enough"));
             account.flush();
             let text = std::fs::read_to_string(&path).unwrap();
             let lines: Vec<serde_json::Value> = text.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
-            assert_eq!(lines.len(), kept + 1, "{before}");
-            assert_eq!((&lines[kept]["event"], &lines[kept]["reason"]), (&"finished".into(), &"enough".into()));
+            assert_eq!(lines.len(), kept + 2, "{before}");
+            assert_eq!(lines[kept]["event"], "started");
+            assert_eq!((&lines[kept + 1]["event"], &lines[kept + 1]["reason"]), (&"finished".into(), &"enough".into()));
         }
     }
 
     #[test]
-    fn a_full_disk_ends_the_account_and_nothing_else() {
-        let mut account = Account(Some(Open {
-            path: "/dev/full".into(),
-            file: BufWriter::new(OpenOptions::new().write(true).open("/dev/full").unwrap()),
-            bytes: 0,
-        }));
+    fn a_full_disk_costs_a_part_of_the_account_and_nothing_else() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("events.jsonl");
+        let file = BufWriter::new(OpenOptions::new().write(true).open("/dev/full").unwrap());
+        let about = Some((path.clone(), "run".to_owned(), 1));
+        let mut account = Account { open: Some(Open { file, bytes: 0 }), about };
         account.write(Entry::Finished { reason: "enough" });
         account.flush();
-        assert!(account.0.is_none());
+        assert!(account.open.is_none());
         account.write(Entry::Finished { reason: "enough" });
+        // There is room again.
+        assert!(account.turn_page());
+        account.flush();
+        let text = std::fs::read_to_string(&path).unwrap();
+        assert!(text.lines().count() == 1 && text.contains("\"started\""), "{text}");
+        assert!(!account.turn_page());
+    }
+
+    #[test]
+    fn a_large_file_is_put_aside() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("events.jsonl");
+        let mut account = Account::open(&path, "run", 0).unwrap();
+        account.write(Entry::Joined { actor: "old", returned: false });
+        assert!(!account.turn_page());
+        account.open.as_mut().unwrap().bytes = LARGEST_FILE;
+        assert!(account.turn_page());
+        account.write(Entry::Joined { actor: "new", returned: false });
+        account.flush();
+        let events = |path: &Path| -> Vec<String> {
+            let text = std::fs::read_to_string(path).unwrap();
+            let lines = text.lines().map(|line| serde_json::from_str::<serde_json::Value>(line).unwrap());
+            lines.map(|line| format!("{} {}", line["event"], line["actor"])).collect()
+        };
+        assert_eq!(events(&dir.path().join("events.1.jsonl")), ["\"started\" null", "\"joined\" \"old\""]);
+        assert_eq!(events(&path), ["\"started\" null", "\"joined\" \"new\""]);
     }
 }

@@ -5,7 +5,7 @@ use std::collections::HashMap;
 use std::io;
 use std::net::{IpAddr, Ipv4Addr, Ipv6Addr};
 use std::pin::Pin;
-use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::task::{Context, Poll, ready};
 use std::time::Duration;
@@ -71,6 +71,11 @@ pub(super) struct Peer {
     most: AtomicUsize,
     /// It is to be dropped, whatever it does.
     expelled: AtomicBool,
+    /// Its first request was paid for with the connection.
+    paid: AtomicBool,
+    /// Bytes that came from it and went to it so far.
+    read: AtomicU64,
+    written: AtomicU64,
 }
 
 impl Gate {
@@ -90,10 +95,11 @@ impl Gate {
     fn admit(self: &Arc<Self>, address: IpAddr) -> Option<Arc<Peer>> {
         let mut counts = self.counts();
         let strangers = counts.strangers.get(&address).copied().unwrap_or_default();
-        let refused = if !counts.attempt(address) {
-            Some(("rate", TOO_OFTEN))
-        } else if counts.connections >= self.room || strangers >= limits::MAX_STRANGERS {
+        // Whoever has to wait for room does not pay for it: many actors that come at once all get in, one after the other.
+        let refused = if counts.connections >= self.room || strangers >= limits::MAX_STRANGERS {
             Some(("full", "too many connections"))
+        } else if !counts.attempt(address) {
+            Some(("rate", TOO_OFTEN))
         } else {
             None
         };
@@ -114,19 +120,27 @@ impl Gate {
             allowance: AtomicUsize::new(limits::STRANGER_BYTES),
             most: AtomicUsize::new(limits::STRANGER_BYTES),
             expelled: AtomicBool::new(false),
+            paid: AtomicBool::new(true),
+            read: AtomicU64::new(0),
+            written: AtomicU64::new(0),
         }))
     }
 
     /// Tells of a refusal, unless this address was told of a moment ago.
     fn complain(&self, address: IpAddr, why: &str) {
         let now = Instant::now();
-        let complaints = &mut self.counts().complaints;
+        let mut counts = self.counts();
+        let complaints = &mut counts.complaints;
         if complaints.len() >= MAX_ADDRESSES {
             complaints.retain(|_, told| now - *told < COMPLAINT_INTERVAL);
         }
         let recent = complaints.get(&address).is_some_and(|told| now - *told < COMPLAINT_INTERVAL);
-        if !recent && complaints.len() < MAX_ADDRESSES {
+        let told = !recent && complaints.len() < MAX_ADDRESSES;
+        if told {
             complaints.insert(address, now);
+        }
+        drop(counts);
+        if told {
             warn!("refused {address}: {why} (further refusals of this address are not told for a minute)");
         }
     }
@@ -170,7 +184,7 @@ impl Peer {
     /// It asks for something.
     #[allow(clippy::result_large_err)] // tonic's own.
     pub(super) fn attempt(&self) -> Result<(), Status> {
-        if self.gate.counts().attempt(self.address) {
+        if self.paid.swap(false, Ordering::Relaxed) || self.gate.counts().attempt(self.address) {
             return Ok(());
         }
         // One that is refused in so many words costs as much as one that is served.
@@ -224,6 +238,16 @@ impl Peer {
         self.allowance.fetch_update(Ordering::Relaxed, Ordering::Relaxed, |left| left.checked_sub(bytes)).is_ok()
     }
 
+    /// Bytes that have come from it.
+    pub(super) fn read(&self) -> u64 {
+        self.read.load(Ordering::Relaxed)
+    }
+
+    /// Bytes that have gone to it.
+    pub(super) fn written(&self) -> u64 {
+        self.written.load(Ordering::Relaxed)
+    }
+
     /// Counts and tells that this connection, or a request, was refused.
     pub(super) fn refuse(&self, reason: &'static str, why: &str) {
         metrics::connection_refused(reason);
@@ -262,6 +286,8 @@ pub(super) struct Connection {
     stream: Box<dyn Duplex>,
     peer: Arc<Peer>,
     alarm: Pin<Box<Sleep>>,
+    /// Since when it takes nothing of what is written to it.
+    unread: Option<Instant>,
     /// Bytes of the preface that have come.
     begun: usize,
 }
@@ -278,6 +304,46 @@ impl Connected for Connection {
 }
 
 impl Connection {
+    /// An error where patience with it has ended. To be asked before all else, of reads and of writes: while a peer does not
+    /// read, HTTP/2 only writes.
+    fn patience(&mut self, cx: &mut Context<'_>) -> io::Result<()> {
+        if self.peer.expelled.load(Ordering::Relaxed) {
+            return Err(io::ErrorKind::ConnectionAborted.into());
+        }
+        let hello = *self.peer.deadline();
+        let unread = self.unread.map(|since| since + limits::SILENCE_LIMIT);
+        let Some(deadline) = hello.into_iter().chain(unread).min() else { return Ok(()) };
+        if self.alarm.deadline() != deadline {
+            self.alarm.as_mut().reset(deadline);
+        }
+        if self.alarm.as_mut().poll(cx).is_pending() {
+            return Ok(());
+        }
+        let unread = unread == Some(deadline);
+        let (reason, why) = if unread { ("unread", "it does not read") } else { ("deadline", "no hello") };
+        self.peer.expelled.store(true, Ordering::Relaxed);
+        self.peer.refuse(reason, why);
+        Err(io::ErrorKind::TimedOut.into())
+    }
+
+    /// Writes, and notes whether the peer takes anything.
+    fn write<T>(
+        &mut self,
+        cx: &mut Context<'_>,
+        write: impl FnOnce(Pin<&mut (dyn Duplex + 'static)>, &mut Context<'_>) -> Poll<io::Result<T>>,
+    ) -> Poll<io::Result<T>> {
+        self.patience(cx)?;
+        let written = write(Pin::new(&mut *self.stream), cx);
+        if written.is_ready() {
+            self.unread = None;
+        } else if self.unread.is_none() {
+            self.unread = Some(Instant::now());
+            // Sets the alarm.
+            self.patience(cx)?;
+        }
+        written
+    }
+
     /// Why it ends after these bytes, in a word and in a sentence.
     fn objection(&mut self, read: &[u8]) -> Option<(&'static str, &'static str)> {
         let expected = &PREFACE[self.begun..];
@@ -295,24 +361,13 @@ impl Connection {
 }
 
 impl AsyncRead for Connection {
-    /// HTTP/2 always waits to read, so this is where a stranger's time ends, and everyone's patience.
     fn poll_read(mut self: Pin<&mut Self>, cx: &mut Context<'_>, buffer: &mut ReadBuf<'_>) -> Poll<io::Result<()>> {
-        if self.peer.expelled.load(Ordering::Relaxed) {
-            return Poll::Ready(Err(io::ErrorKind::ConnectionAborted.into()));
-        }
-        let deadline = *self.peer.deadline();
-        if let Some(deadline) = deadline {
-            if self.alarm.deadline() != deadline {
-                self.alarm.as_mut().reset(deadline);
-            }
-            if self.alarm.as_mut().poll(cx).is_ready() {
-                self.peer.refuse("deadline", "no hello");
-                return Poll::Ready(Err(io::ErrorKind::TimedOut.into()));
-            }
-        }
+        self.patience(cx)?;
         let before = buffer.filled().len();
         ready!(Pin::new(&mut self.stream).poll_read(cx, buffer))?;
-        if let Some((reason, why)) = self.objection(&buffer.filled()[before..]) {
+        let read = &buffer.filled()[before..];
+        self.peer.read.fetch_add(read.len() as u64, Ordering::Relaxed);
+        if let Some((reason, why)) = self.objection(read) {
             self.peer.expelled.store(true, Ordering::Relaxed);
             self.peer.refuse(reason, why);
             return Poll::Ready(Err(io::ErrorKind::InvalidData.into()));
@@ -323,7 +378,9 @@ impl AsyncRead for Connection {
 
 impl AsyncWrite for Connection {
     fn poll_write(mut self: Pin<&mut Self>, cx: &mut Context<'_>, bytes: &[u8]) -> Poll<io::Result<usize>> {
-        Pin::new(&mut self.stream).poll_write(cx, bytes)
+        let written = ready!(self.write(cx, |stream, cx| stream.poll_write(cx, bytes)))?;
+        self.peer.written.fetch_add(written as u64, Ordering::Relaxed);
+        Poll::Ready(Ok(written))
     }
 
     fn poll_write_vectored(
@@ -331,7 +388,9 @@ impl AsyncWrite for Connection {
         cx: &mut Context<'_>,
         parts: &[io::IoSlice<'_>],
     ) -> Poll<io::Result<usize>> {
-        Pin::new(&mut self.stream).poll_write_vectored(cx, parts)
+        let written = ready!(self.write(cx, |stream, cx| stream.poll_write_vectored(cx, parts)))?;
+        self.peer.written.fetch_add(written as u64, Ordering::Relaxed);
+        Poll::Ready(Ok(written))
     }
 
     fn is_write_vectored(&self) -> bool {
@@ -339,11 +398,11 @@ impl AsyncWrite for Connection {
     }
 
     fn poll_flush(mut self: Pin<&mut Self>, cx: &mut Context<'_>) -> Poll<io::Result<()>> {
-        Pin::new(&mut self.stream).poll_flush(cx)
+        self.write(cx, AsyncWrite::poll_flush)
     }
 
     fn poll_shutdown(mut self: Pin<&mut Self>, cx: &mut Context<'_>) -> Poll<io::Result<()>> {
-        Pin::new(&mut self.stream).poll_shutdown(cx)
+        self.write(cx, AsyncWrite::poll_shutdown)
     }
 }
 
@@ -379,7 +438,7 @@ pub(super) async fn accept(
             if let Some(stream) = greet(stream, acceptor, &peer).await {
                 let alarm = Box::pin(sleep_until(Instant::now() + limits::HELLO_DEADLINE));
                 // Nobody takes it if the service is ending.
-                let _ = accepted.send(Ok(Connection { stream, peer, alarm, begun: 0 })).await;
+                let _ = accepted.send(Ok(Connection { stream, peer, alarm, unread: None, begun: 0 })).await;
             }
         });
     }

@@ -5,17 +5,18 @@
 //! target, so it does not depend on who sampled what, or when.
 
 use std::collections::{BTreeMap, BTreeSet, HashMap, HashSet};
-use std::sync::Arc;
-use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::{Arc, OnceLock};
 use std::time::{Duration, Instant};
 
 use popgym_proto::{Episode, EpisodeBatch, Hello, Leases, OpenEpoch, WeightSet, limits};
+use tokio::sync::mpsc::error::TrySendError;
 use tokio::sync::{mpsc, oneshot};
 use tonic::Status;
 use tracing::info;
 
 use super::account::{Account, Entry, ranges};
 use super::planner::{LengthEstimate, Progress, Seat, Target, assign, further_leases};
+use super::roster::{ActorView, Roster};
 use super::session::Order;
 use super::{Collected, metrics};
 
@@ -52,14 +53,11 @@ impl Farewell {
     }
 }
 
-/// What others may look at at any time.
-#[derive(Debug, Default)]
-pub(super) struct Shared {
-    pub(super) actors: AtomicUsize,
-}
-
 /// Names of actors that are remembered, to tell who returns. Beyond, an actor that returns looks new; nothing else.
 const MAX_KNOWN_ACTORS: usize = 65_536;
+
+/// How often the roster is written anew, at most.
+const ROSTER_INTERVAL: Duration = Duration::from_secs(1);
 
 struct Session {
     /// Its actor's name, or, where another session has that, one like it.
@@ -68,11 +66,14 @@ struct Session {
     orders: mpsc::Sender<Order>,
     /// Version of the weights that were sent to it.
     version: Option<u64>,
-    held: BTreeSet<u64>,
-    /// Since when its leases wait: it got the first, or sent an episode.
-    waiting: Instant,
-    /// The epoch that it last sent an episode of.
-    worked: Option<u64>,
+    /// Its leases, and since when it has them.
+    held: BTreeMap<u64, Instant>,
+    joined: Instant,
+    /// The epoch that it last sent an episode of, and when.
+    worked: Option<(u64, Instant)>,
+    /// Episodes accepted from it, and their steps.
+    episodes: u64,
+    steps: u64,
 }
 
 struct Epoch {
@@ -80,8 +81,6 @@ struct Epoch {
     weights: WeightSet,
     target: Target,
     opened: Instant,
-    /// When the last of its episodes came.
-    progressed: Instant,
     /// How long leases may wait while others have nothing to do.
     patience: Duration,
     /// The lowest number that was never leased.
@@ -105,8 +104,10 @@ pub(super) struct Coordinator {
     epoch: Option<Epoch>,
     length: LengthEstimate,
     results: std::sync::mpsc::Sender<Collected>,
-    shared: Arc<Shared>,
+    roster: Arc<Roster>,
     account: Account,
+    /// Why the run is complete, for who comes when all this has gone.
+    complete: Arc<OnceLock<String>>,
     finishing: Option<(Farewell, oneshot::Sender<()>)>,
 }
 
@@ -114,8 +115,9 @@ impl Coordinator {
     pub(super) fn new(
         max_steps: u32,
         results: std::sync::mpsc::Sender<Collected>,
-        shared: Arc<Shared>,
+        roster: Arc<Roster>,
         account: Account,
+        complete: Arc<OnceLock<String>>,
     ) -> Self {
         Self {
             sessions: BTreeMap::new(),
@@ -123,8 +125,9 @@ impl Coordinator {
             epoch: None,
             length: LengthEstimate::unknown(max_steps),
             results,
-            shared,
+            roster,
             account,
+            complete,
             finishing: None,
         }
     }
@@ -133,6 +136,8 @@ impl Coordinator {
     pub(super) async fn run(mut self, mut events: mpsc::Receiver<Event>) {
         let mut pending = Vec::with_capacity(limits::COORDINATOR_QUEUE);
         let mut clock = tokio::time::interval(limits::HEARTBEAT_INTERVAL);
+        let mut shown = Instant::now();
+        self.show();
         loop {
             // All that has arrived is handled before leases are planned: one plan, not one for each message.
             tokio::select! {
@@ -151,6 +156,10 @@ impl Coordinator {
             self.lease();
             self.account.flush();
             metrics::queues(queued, self.epoch.as_ref().map_or(0, |epoch| epoch.holders.len()));
+            if shown.elapsed() >= ROSTER_INTERVAL {
+                shown = Instant::now();
+                self.show();
+            }
             if self.sessions.is_empty()
                 && let Some((_, gone)) = self.finishing.take()
             {
@@ -178,6 +187,8 @@ impl Coordinator {
             Event::Finish { farewell, gone } => {
                 if let Farewell::Complete(reason) = &farewell {
                     self.account.write(Entry::Finished { reason });
+                    // Told but once.
+                    let _ = self.complete.set(reason.clone());
                 }
                 self.epoch = None;
                 self.finishing = Some((farewell.clone(), gone));
@@ -187,6 +198,10 @@ impl Coordinator {
     }
 
     fn join(&mut self, session: u64, hello: Hello, orders: mpsc::Sender<Order>) -> Result<(), Status> {
+        if self.sessions.len() >= limits::MAX_SESSIONS {
+            let full = format!("this learner has {} actors, which is the most it takes", limits::MAX_SESSIONS);
+            return Err(Status::resource_exhausted(full));
+        }
         let own = |older: &Hello| older.actor == hello.actor && older.key == hello.key;
         let older = self.sessions.iter().find(|(_, session)| own(&session.hello));
         if let Some((&older, Session { hello: Hello { incarnation, .. }, .. })) = older {
@@ -205,8 +220,18 @@ impl Coordinator {
         info!(actor, slots = hello.slots, actors = self.sessions.len() + 1, "{what}");
         metrics::joined(returned);
         self.account.write(Entry::Joined { actor: &actor, returned });
-        let (held, waiting) = (BTreeSet::new(), Instant::now());
-        self.sessions.insert(session, Session { actor, hello, orders, version: None, held, waiting, worked: None });
+        let newcomer = Session {
+            actor,
+            hello,
+            orders,
+            version: None,
+            held: BTreeMap::new(),
+            joined: Instant::now(),
+            worked: None,
+            episodes: 0,
+            steps: 0,
+        };
+        self.sessions.insert(session, newcomer);
         self.count_actors();
         Ok(())
     }
@@ -241,7 +266,8 @@ impl Coordinator {
     /// Hands an order to a session. One that leaves its orders unread is dropped: nothing here waits.
     fn order(&mut self, id: u64, order: Order) {
         let Some(session) = self.sessions.get(&id) else { return };
-        if session.orders.try_send(order).is_err() {
+        // One that has ended by itself says so itself.
+        if let Err(TrySendError::Full(_)) = session.orders.try_send(order) {
             self.leave(id, "left its messages unread");
         }
     }
@@ -264,10 +290,10 @@ impl Coordinator {
             return;
         }
         if let Some(epoch) = &mut self.epoch {
-            for index in &session.held {
+            for index in session.held.keys() {
                 epoch.holders.remove(index);
             }
-            epoch.lost.extend(session.held);
+            epoch.lost.extend(session.held.into_keys());
         }
         metrics::leases_lost(leases);
         let actors = self.sessions.len();
@@ -275,8 +301,24 @@ impl Coordinator {
     }
 
     fn count_actors(&self) {
-        self.shared.actors.store(self.sessions.len(), Ordering::Relaxed);
+        self.roster.set_count(self.sessions.len());
         metrics::actors(self.sessions.len());
+    }
+
+    /// Lets others see how the actors stand.
+    fn show(&self) {
+        let view = |session: &Session| ActorView {
+            name: session.actor.clone(),
+            slots: session.hello.slots,
+            leases: session.held.len(),
+            episodes: session.episodes,
+            steps: session.steps,
+            connected_seconds: session.joined.elapsed().as_secs_f64(),
+            silent_seconds: session.worked.map(|(_, at)| at.elapsed().as_secs_f64()),
+        };
+        let actors: Vec<_> = self.sessions.values().map(view).collect();
+        metrics::sampling(actors.iter().filter(|actor| actor.leases > 0).count());
+        self.roster.set_actors(actors);
     }
 
     fn open(&mut self, epoch: u64, weights: WeightSet, target: Target) {
@@ -284,13 +326,17 @@ impl Coordinator {
             session.held.clear();
         }
         metrics::opened(epoch, weights.version);
+        if self.account.turn_page() {
+            for session in self.sessions.values() {
+                self.account.write(Entry::Joined { actor: &session.actor, returned: true });
+            }
+        }
         self.account.write(Entry::Opened { epoch, version: weights.version, target });
         self.epoch = Some(Epoch {
             number: epoch,
             weights,
             target,
             opened: Instant::now(),
-            progressed: Instant::now(),
             patience: limits::LEASE_PATIENCE,
             next: 0,
             lost: BTreeSet::new(),
@@ -324,8 +370,10 @@ impl Coordinator {
         // A duplicate is not held any more, so it is refused here too.
         let (mut accepted, mut unleased) = (Vec::new(), Vec::new());
         for episode in episodes {
-            if session.held.remove(&episode.index) {
-                metrics::accepted();
+            if session.held.remove(&episode.index).is_some() {
+                metrics::accepted(episode.steps);
+                session.episodes += 1;
+                session.steps += episode.steps as u64;
                 accepted.push(episode.index);
                 self.length.see(episode.steps);
                 epoch.accept(episode);
@@ -334,8 +382,7 @@ impl Coordinator {
             }
         }
         if !accepted.is_empty() {
-            let now = Instant::now();
-            (session.waiting, session.worked, epoch.progressed) = (now, Some(number), now);
+            session.worked = Some((number, Instant::now()));
             let episodes = ranges(accepted);
             self.account.write(Entry::Accepted { epoch: number, version, actor, episodes });
         }
@@ -367,19 +414,33 @@ impl Coordinator {
         let _ = self.results.send(collected);
     }
 
-    /// Takes the leases of those who do nothing about them, where others who work wait for that and nothing else.
+    /// Takes the leases of those who are too slow about them, where others who could work wait for nothing else.
     fn take_overdue(&mut self, now: Instant) {
         let Some(epoch) = &mut self.epoch else { return };
-        let waits = |session: &Session| session.held.is_empty() && session.worked == Some(epoch.number);
-        if !self.sessions.values().any(waits) {
+        // One that has never worked may be no better.
+        let could_work = |session: &Session| {
+            session.worked.is_some() || now.saturating_duration_since(session.joined) > epoch.patience
+        };
+        if !self.sessions.values().any(|session| session.held.is_empty() && could_work(session)) {
             return;
         }
-        let usual = epoch.progressed - epoch.opened;
-        let patience = epoch.patience.max(limits::LEASE_PATIENCE_FACTOR * usual);
-        let is_overdue =
-            |session: &Session| !session.held.is_empty() && now.saturating_duration_since(session.waiting) > patience;
-        let overdue: Vec<u64> =
-            self.sessions.iter().filter(|(_, session)| is_overdue(session)).map(|(&id, _)| id).collect();
+        // What an actor sends now and then says nothing of how long all of it takes the others.
+        let took = |session: &Session| {
+            let (number, at) = session.worked?;
+            (number == epoch.number).then(|| at.saturating_duration_since(epoch.opened))
+        };
+        let overdue: Vec<u64> = self
+            .sessions
+            .iter()
+            .filter(|&(id, session)| {
+                let Some(&oldest) = session.held.values().min() else { return false };
+                let others = self.sessions.iter().filter(|&(other, _)| other != id);
+                let usual = others.filter_map(|(_, other)| took(other)).max().unwrap_or_default();
+                let patience = epoch.patience.max(limits::LEASE_PATIENCE_FACTOR * usual);
+                now.saturating_duration_since(oldest) > patience
+            })
+            .map(|(&id, _)| id)
+            .collect();
         if !overdue.is_empty() {
             // It may be the episode that takes so long, whoever samples it.
             epoch.patience *= 2;
@@ -414,10 +475,8 @@ impl Coordinator {
         let sessions = self.sessions.len();
         for (id, episodes) in leases {
             if let Some(session) = self.sessions.get_mut(&id) {
-                if session.held.is_empty() {
-                    session.waiting = Instant::now();
-                }
-                session.held.extend(&episodes);
+                let now = Instant::now();
+                session.held.extend(episodes.iter().map(|&index| (index, now)));
                 let episodes = ranges(episodes.iter().copied());
                 self.account.write(Entry::Leased { epoch: number, actor: &session.actor, episodes });
             }

@@ -5,6 +5,7 @@ use metrics::{counter, describe_counter, describe_gauge, gauge};
 /// Names and explains every metric of the service.
 pub(super) fn describe() {
     describe_gauge!("popgym_learner_actors", "Actors that are connected and ready");
+    describe_gauge!("popgym_learner_actors_sampling", "Of these, actors that hold leases");
     describe_gauge!("popgym_learner_connections", "TCP connections, of actors and others");
     describe_counter!(
         "popgym_learner_connections_refused_total",
@@ -28,6 +29,10 @@ pub(super) fn describe() {
     describe_counter!("popgym_learner_leases_lost_total", "Leases of actors that went away; they are leased again");
     describe_counter!("popgym_learner_episodes_accepted_total", "Episodes received and wanted");
     describe_counter!(
+        "popgym_learner_steps_accepted_total",
+        "Their environment steps, those of surplus episodes included"
+    );
+    describe_counter!(
         "popgym_learner_episodes_refused_total",
         "Episodes received and dropped, by reason: late, unleased, version, excess; and messages by what was illegal: \
          missing, value, length, element, encoding"
@@ -40,6 +45,10 @@ pub(super) fn describe() {
 
 pub(super) fn actors(count: usize) {
     gauge!("popgym_learner_actors").set(count as f64);
+}
+
+pub(super) fn sampling(count: usize) {
+    gauge!("popgym_learner_actors_sampling").set(count as f64);
 }
 
 pub(super) fn connections(count: usize) {
@@ -75,8 +84,9 @@ pub(super) fn leases_lost(count: usize) {
     counter!("popgym_learner_leases_lost_total").increment(count as u64);
 }
 
-pub(super) fn accepted() {
+pub(super) fn accepted(steps: usize) {
     counter!("popgym_learner_episodes_accepted_total").increment(1);
+    counter!("popgym_learner_steps_accepted_total").increment(steps as u64);
 }
 
 pub(super) fn refused(reason: &'static str, episodes: usize) {

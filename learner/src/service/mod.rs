@@ -9,6 +9,7 @@
 //! | `session` | one actor: handshake, checks, deadlines |
 //! | `coordinator` | the single owner of sessions, leases and episodes |
 //! | [`planner`] | how many leases, and to whom (pure) |
+//! | [`roster`] | which actors are here, for others to see |
 //! | `metrics` | what Prometheus sees |
 //!
 //! All of it runs on threads of its own. The trainer's thread opens an epoch, collects its batch, and at the end
@@ -25,8 +26,8 @@ use std::time::Duration;
 
 use anyhow::Context as _;
 use bytes::Bytes;
-use popgym_proto::{Episode, EpisodeSpec, Fingerprint, RunSpec, Token, WeightSet, limits, transport, wire};
-use tokio::sync::{Semaphore, mpsc, oneshot};
+use popgym_proto::{Episode, EpisodeSpec, Fingerprint, RunSpec, Token, WeightSet, limits, monitor, transport, wire};
+use tokio::sync::{mpsc, oneshot};
 use tokio_stream::Stream;
 use tokio_stream::wrappers::ReceiverStream;
 use tonic::service::interceptor::{InterceptedService, InterceptorLayer};
@@ -39,16 +40,18 @@ mod coordinator;
 mod metrics;
 pub mod planner;
 mod reloaded;
+pub mod roster;
 mod session;
 mod tls;
 
 pub use planner::Target;
 pub use tls::TlsFiles;
 
-use account::{Account, Entry};
+use account::Account;
 use connections::{Gate, Peer};
-use coordinator::{Coordinator, Event, Farewell, Shared};
+use coordinator::{Coordinator, Event, Farewell};
 use reloaded::Reloaded;
+use roster::Roster;
 use session::Terms;
 
 /// Threads of the network. One serves hundreds of actors; the second keeps heartbeats going while the first checks a
@@ -91,7 +94,7 @@ pub struct Service {
     runtime: tokio::runtime::Runtime,
     events: mpsc::Sender<Event>,
     results: Receiver<Collected>,
-    shared: Arc<Shared>,
+    roster: Arc<Roster>,
     address: SocketAddr,
     /// Sent to when the server is to end.
     closing: oneshot::Sender<()>,
@@ -127,16 +130,16 @@ impl Service {
         let token = token_file.map(load_token).transpose()?;
         let (events, inbox) = mpsc::channel(limits::COORDINATOR_QUEUE);
         let (results_in, results) = std::sync::mpsc::channel();
-        let shared = Arc::new(Shared::default());
-        let mut account = account.map(Account::open).transpose()?.unwrap_or_default();
-        account.write(Entry::Started { run: &spec.run, build: env!("CARGO_PKG_VERSION"), lag: spec.lag });
-        let coordinator = Coordinator::new(spec.max_episode_steps, results_in, shared.clone(), account);
+        let roster = Arc::new(Roster::default());
+        let account = account.map(|path| Account::open(path, &spec.run, spec.lag)).transpose()?.unwrap_or_default();
+        let complete = Arc::default();
+        let coordinator =
+            Coordinator::new(spec.max_episode_steps, results_in, roster.clone(), account, Arc::clone(&complete));
         runtime.spawn(coordinator.run(inbox));
         let largest = episodes.largest_message();
         let endpoint = Endpoint {
-            terms: Arc::new(Terms { spec, episodes, fingerprint }),
+            terms: Arc::new(Terms { spec, episodes, fingerprint, complete }),
             events: events.clone(),
-            permits: Arc::new(Semaphore::new(limits::MAX_SESSIONS)),
             sessions: AtomicU64::new(0),
         };
         let (accepted, connections) = mpsc::channel(limits::STREAM_QUEUE);
@@ -161,7 +164,8 @@ impl Service {
                 tracing::error!("the service for actors has ended: {error}");
             }
         });
-        Ok(Self { runtime, events, results, shared, address, closing, server, open: Cell::new(None) })
+        monitor::set_ready(true);
+        Ok(Self { runtime, events, results, roster, address, closing, server, open: Cell::new(None) })
     }
 
     /// Where it listens.
@@ -171,7 +175,12 @@ impl Service {
 
     /// Actors that are connected and ready.
     pub fn actors(&self) -> usize {
-        self.shared.actors.load(Ordering::Relaxed)
+        self.roster.count()
+    }
+
+    /// Who they are.
+    pub fn roster(&self) -> Arc<Roster> {
+        self.roster.clone()
     }
 
     /// Opens `epoch` for sampling with `weights` (safetensors) of `version`. An epoch that was open before is void.
@@ -215,6 +224,7 @@ impl Service {
     }
 
     fn end(self, farewell: Farewell) {
+        monitor::set_ready(false);
         let (gone, all_gone) = oneshot::channel();
         if self.events.blocking_send(Event::Finish { farewell, gone }).is_ok() {
             let wait = async { tokio::time::timeout(limits::FINISH_DEADLINE, all_gone).await };
@@ -245,7 +255,9 @@ fn count(request: Request<()>) -> Result<Request<()>, Status> {
 /// Refuses a request without the token, before anything of it is read.
 #[allow(clippy::result_large_err)] // tonic's own.
 fn authorise(token: Option<&Reloaded<Token>>, request: Request<()>) -> Result<Request<()>, Status> {
-    if token.is_none_or(|token| token.get().is_in(request.metadata())) {
+    let shows = |token: Arc<Token>| token.is_in(request.metadata());
+    // A new one may have been in its file for less than a moment.
+    if token.is_none_or(|token| shows(token.get()) || shows(token.get_now())) {
         return Ok(request);
     }
     let shown = request.metadata().contains_key("authorization");
@@ -263,7 +275,6 @@ fn peer<T>(request: &Request<T>) -> Result<Arc<Peer>, Status> {
 struct Endpoint {
     terms: Arc<Terms>,
     events: mpsc::Sender<Event>,
-    permits: Arc<Semaphore>,
     sessions: AtomicU64,
 }
 
@@ -276,11 +287,6 @@ impl wire::learner_server::Learner for Endpoint {
         request: Request<Streaming<wire::FromActor>>,
     ) -> Result<Response<Self::SessionStream>, Status> {
         let peer = peer(&request)?;
-        let Ok(permit) = self.permits.clone().try_acquire_owned() else {
-            let full = format!("this learner has {} actors, which is the most it takes", limits::MAX_SESSIONS);
-            peer.refuse_session("full", &full);
-            return Err(Status::resource_exhausted(full));
-        };
         if !peer.occupy() {
             let second = "this connection has a session already";
             peer.refuse_session("second", second);
@@ -292,7 +298,6 @@ impl wire::learner_server::Learner for Endpoint {
         tokio::spawn(async move {
             session::serve(id, &terms, request.into_inner(), &peer, replies, events).await;
             peer.dismiss();
-            drop(permit);
         });
         Ok(Response::new(Box::pin(ReceiverStream::new(stream))))
     }

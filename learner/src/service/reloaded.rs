@@ -42,8 +42,17 @@ impl<T> Reloaded<T> {
 
     /// What the files hold, or held when they were last good.
     pub(super) fn get(&self) -> Arc<T> {
+        self.get_within(INTERVAL)
+    }
+
+    /// The same, but looks at the files in any case.
+    pub(super) fn get_now(&self) -> Arc<T> {
+        self.get_within(Duration::ZERO)
+    }
+
+    fn get_within(&self, interval: Duration) -> Arc<T> {
         let mut state = self.state.lock().unwrap_or_else(PoisonError::into_inner);
-        if state.looked.elapsed() >= INTERVAL {
+        if state.looked.elapsed() >= interval {
             state.looked = Instant::now();
             let stamps = stamps(&self.files);
             if stamps != state.stamps {

@@ -2,6 +2,7 @@
 
 use std::error::Error as _;
 use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{Arc, OnceLock};
 
 use popgym_proto::{
     ActorMessage, EpisodeBatch, EpisodeSpec, Fingerprint, Hello, LearnerMessage, Leases, OpenEpoch, PROTOCOL_VERSION,
@@ -23,6 +24,8 @@ pub(super) struct Terms {
     pub(super) spec: RunSpec,
     pub(super) episodes: EpisodeSpec,
     pub(super) fingerprint: Fingerprint,
+    /// Why the run is complete, once it is.
+    pub(super) complete: Arc<OnceLock<String>>,
 }
 
 /// What the coordinator tells a session.
@@ -50,6 +53,8 @@ pub(super) type Replies = mpsc::Sender<Result<wire::FromLearner, Status>>;
 enum Fault {
     /// It is not an actor for this run.
     Handshake,
+    /// It is one too many.
+    Full,
     /// It said nothing for too long.
     Silent,
     /// It does not read what it is told.
@@ -69,6 +74,7 @@ impl Fault {
     fn label(self) -> &'static str {
         match self {
             Self::Handshake => "handshake",
+            Self::Full => "full",
             Self::Silent => "silent",
             Self::Unread => "unread",
             Self::Overdue => "overdue",
@@ -128,44 +134,52 @@ pub(super) async fn serve(
 
 /// All of a session but its last word.
 async fn attend(id: u64, requests: &mut Requests<'_>, replies: &Replies, events: &mpsc::Sender<Event>) -> End {
-    let ending = || Status::unavailable("the learner is ending").into();
     let hello = match handshake(requests, replies).await {
         Ok(hello) => hello,
         Err(end) => return end,
     };
+    let (peer, terms) = (requests.peer, requests.terms);
     let (to_session, orders) = mpsc::channel(limits::SESSION_QUEUE);
     let (reply, accepted) = oneshot::channel();
     if events.send(Event::Joined { session: id, hello, orders: to_session, reply }).await.is_err() {
-        return ending();
+        return ending(terms, peer, replies).await;
     }
     match accepted.await {
-        Ok(Ok(())) => requests.peer.welcome(requests.terms.episodes.largest_message()),
+        Ok(Ok(())) => peer.welcome(terms.episodes.largest_message()),
+        Ok(Err(status)) if status.code() == Code::ResourceExhausted => return End::because(Fault::Full, status),
         Ok(Err(status)) => return End::because(Fault::Handshake, status),
-        Err(_) => return ending(),
+        Err(_) => return ending(terms, peer, replies).await,
     }
     let leased = AtomicU64::new(0);
     let end = tokio::select! {
         end = listen(id, requests, &leased, events) => end,
-        end = speak(orders, replies, &leased) => end,
+        end = speak(peer, orders, replies, &leased) => end,
     };
     // Fails only when the coordinator has ended, which then does not care.
     let _ = events.send(Event::Left { session: id, reason: end.status.message().to_owned() }).await;
     end
 }
 
+/// For one who comes when the coordinator has gone.
+async fn ending(terms: &Terms, peer: &Peer, replies: &Replies) -> End {
+    if let Some(reason) = terms.complete.get() {
+        // Whether it is heard or not, the session ends.
+        let _ = send(peer, replies, LearnerMessage::Stop { reason: reason.clone() }).await;
+    }
+    Status::unavailable("the learner is ending").into()
+}
+
 /// Hello, welcome, ready.
 async fn handshake(requests: &mut Requests<'_>, replies: &Replies) -> Result<Hello, End> {
     let terms = requests.terms;
     let refused = |status| End::because(Fault::Handshake, status);
-    let hello = match timeout(limits::HELLO_DEADLINE, requests.next()).await {
-        Ok(Ok(ActorMessage::Hello(hello))) => hello,
-        Ok(Ok(_)) => return Err(refused(Status::invalid_argument("the first message must be a hello"))),
-        Ok(Err(end)) => return Err(end),
-        Err(_) => return Err(refused(Status::deadline_exceeded("no hello"))),
+    // Its connection has a deadline for that.
+    let ActorMessage::Hello(hello) = requests.next().await? else {
+        return Err(refused(Status::invalid_argument("the first message must be a hello")));
     };
     check_hello(terms, &hello).map_err(refused)?;
     requests.peer.greet();
-    send(replies, LearnerMessage::Welcome(terms.spec.clone())).await?;
+    send(requests.peer, replies, LearnerMessage::Welcome(terms.spec.clone())).await?;
     let ready = async {
         loop {
             match requests.next().await? {
@@ -214,10 +228,11 @@ fn check_hello(terms: &Terms, hello: &Hello) -> Result<(), Status> {
 async fn listen(id: u64, requests: &mut Requests<'_>, leased: &AtomicU64, events: &mpsc::Sender<Event>) -> End {
     let mut sent = 0;
     loop {
-        let message = match timeout(limits::SILENCE_LIMIT, requests.next()).await {
-            Ok(Ok(message)) => message,
-            Ok(Err(end)) => return end,
-            Err(_) => {
+        let peer = requests.peer;
+        let message = match unless_still(requests.next(), || peer.read()).await {
+            Some(Ok(message)) => message,
+            Some(Err(end)) => return end,
+            None => {
                 let silent = format!("silent for {} s", limits::SILENCE_LIMIT.as_secs());
                 return End::because(Fault::Silent, Status::deadline_exceeded(silent));
             }
@@ -252,14 +267,14 @@ fn check_count(batch: &EpisodeBatch, sent: u64, leased: u64) -> Result<(), End> 
 }
 
 /// Sends what the coordinator orders, and heartbeats while there is nothing to say.
-async fn speak(mut orders: mpsc::Receiver<Order>, replies: &Replies, leased: &AtomicU64) -> End {
+async fn speak(peer: &Peer, mut orders: mpsc::Receiver<Order>, replies: &Replies, leased: &AtomicU64) -> End {
     let mut heartbeat = interval(limits::HEARTBEAT_INTERVAL);
     heartbeat.set_missed_tick_behavior(MissedTickBehavior::Delay);
     loop {
         let order = tokio::select! {
             order = orders.recv() => order,
             _ = heartbeat.tick() => {
-                if let Err(end) = send(replies, LearnerMessage::Heartbeat).await {
+                if let Err(end) = send(peer, replies, LearnerMessage::Heartbeat).await {
                     return end;
                 }
                 continue;
@@ -284,17 +299,31 @@ async fn speak(mut orders: mpsc::Receiver<Order>, replies: &Replies, leased: &At
             // Only a coordinator that drops a session for leaving its orders unread lets go without a word.
             None => return unread(),
         };
-        if let Err(end) = send(replies, message).await {
+        if let Err(end) = send(peer, replies, message).await {
             return end;
         }
     }
 }
 
-/// Sends a message. One that is not taken for [`limits::SILENCE_LIMIT`] comes too late: to the actor, this learner has gone.
-async fn send(replies: &Replies, message: LearnerMessage) -> Result<(), End> {
-    match timeout(limits::SILENCE_LIMIT, replies.send(Ok(message.into_wire()))).await {
-        Ok(sent) => sent.map_err(|_| Status::cancelled("the connection is gone").into()),
-        Err(_) => Err(unread()),
+/// Sends a message, unless the peer takes none.
+async fn send(peer: &Peer, replies: &Replies, message: LearnerMessage) -> Result<(), End> {
+    match unless_still(replies.send(Ok(message.into_wire())), || peer.written()).await {
+        Some(sent) => sent.map_err(|_| Status::cancelled("the connection is gone").into()),
+        None => Err(unread()),
+    }
+}
+
+/// What `action` comes to; `None` if it takes longer than [`limits::SILENCE_LIMIT`] while next to no bytes move.
+async fn unless_still<T>(action: impl Future<Output = T>, bytes: impl Fn() -> u64) -> Option<T> {
+    let mut action = std::pin::pin!(action);
+    loop {
+        let before = bytes();
+        if let Ok(outcome) = timeout(limits::SILENCE_LIMIT, &mut action).await {
+            return Some(outcome);
+        }
+        if bytes() - before < limits::SLOWEST_BYTES {
+            return None;
+        }
     }
 }
 
