@@ -15,10 +15,10 @@ SECONDS_EACH ?= 1800
 # Another libtorch of the user's would be compiled against but not found at run time.
 unexport LIBTORCH LIBTORCH_INCLUDE LIBTORCH_LIB LIBTORCH_STATIC LIBTORCH_USE_PYTORCH
 
-.PHONY: help setup build train test soak lint bench fuzz clean
+.PHONY: help setup build train test soak slurm containers lint bench fuzz up down logs clean
 
 help: ## this list
-	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "make %-8s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
+	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "make %-10s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
 
 setup: ## fetch libtorch into the user's cache and link it here
 	@deploy/setup.sh
@@ -35,13 +35,30 @@ test: setup ## all tests
 soak: setup ## the long forms of tests: 200 random faults in a run, hostile actors for minutes, with their figures
 	POPGYM_SOAK=1 $(CARGO) test $(CARGO_FLAGS) --workspace --test soak --test floods -- --nocapture --test-threads 1
 
+slurm: setup ## deploy/slurm on a real Slurm, where Debian's slurmctld, slurmd, slurm-client and munge are installed
+	@missing=; \
+	for program in munged slurmctld slurmd sbatch; do \
+		PATH="$$PATH:/usr/sbin" command -v "$$program" >/dev/null || missing+=" $$program"; \
+	done; \
+	if [[ -z $$missing ]]; then \
+		$(CARGO) test $(CARGO_FLAGS) --workspace --test slurm -- --ignored --nocapture --test-threads 1; \
+	else \
+		echo "skipped: tests on a real Slurm (not installed:$$missing)"; \
+	fi
+
+containers: setup ## deploy/compose.yaml in a Docker engine, with images built on bases that are made for it
+	POPGYM_CONTAINERS=1 $(CARGO) test $(CARGO_FLAGS) --workspace --test containers -- --nocapture
+
 lint: setup ## formatting, clippy, and licences and advisories where cargo-deny is installed
 	$(CARGO) fmt --all --check
 	$(CARGO) clippy $(CARGO_FLAGS) --workspace --all-targets -- -D warnings
-	@if $(CARGO) deny --version >/dev/null 2>&1; then \
+	@if ! $(CARGO) deny --version >/dev/null 2>&1; then \
+		echo "skipped: cargo deny check (cargo-deny is not installed)"; \
+	elif $(CARGO) deny fetch db; then \
 		$(CARGO) deny check; \
 	else \
-		echo "skipped: cargo deny check (cargo-deny is not installed)"; \
+		echo "skipped: advisories (their database cannot be reached)"; \
+		$(CARGO) deny check bans licenses sources; \
 	fi
 
 bench: setup ## all benchmarks
@@ -57,6 +74,19 @@ fuzz: setup ## fuzz what reads from outside, SECONDS_EACH=1800 for each target; 
 			".cache/fuzz/$$target" "tests/fuzz/corpus/$$target" -- \
 			-max_total_time=$(SECONDS_EACH) -timeout=20 -rss_limit_mb=4096; \
 	done
+
+up: ## a learner and actors in containers, Prometheus and Grafana if they can be had; deploy/.env has the settings
+	@deploy/compose.sh up --detach --build
+	@for service in prometheus grafana; do \
+		deploy/compose.sh up --detach "$$service" || \
+			echo "without $$service: its image cannot be had (deploy/.env may name another)"; \
+	done
+
+logs: ## what the containers say
+	@deploy/compose.sh logs --follow --tail 100
+
+down: ## remove the containers; runs and secrets stay
+	@deploy/compose.sh down
 
 clean: ## remove what was built here; the cached libtorch stays
 	$(CARGO) clean
