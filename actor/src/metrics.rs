@@ -50,6 +50,8 @@ pub fn install(listen: Option<SocketAddr>) -> anyhow::Result<()> {
     describe_gauge!("popgym_actor_weights_version", "Version of the weights in use");
     describe_gauge!("popgym_actor_epoch", "Epoch that is being sampled");
     describe_gauge!("popgym_actor_live_rows", "Episodes being stepped");
+    // Prometheus sees no increase from nothing to 1.
+    counter!("popgym_actor_reconnects_total").increment(0);
     Ok(())
 }
 

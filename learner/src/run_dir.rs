@@ -104,7 +104,7 @@ impl RunDir {
 /// too, and its last weights were saved (or all checkpoints were removed since).
 pub(crate) fn finished(path: &Path, config: &Config) -> Option<Summary> {
     let summary: Summary = serde_json::from_slice(&fs::read(path.join(SummaryJson::FILE)).ok()?).ok()?;
-    let ended = summary.stopped_by != "interrupt" && config.reached(summary.env_steps, summary.mmer).is_some();
+    let ended = summary.is_complete() && config.reached(summary.env_steps, summary.mmer).is_some();
     let last = MetricsCsv::read(path).ok()?.pop()?;
     let dir = path.join(CHECKPOINTS);
     let checkpoints = checkpoint::list(&dir).ok()?;

@@ -4,6 +4,7 @@
 //! update; with lag 1 with version `k - 1`, while the learner learns from epoch `k - 1`. Nothing here depends on who
 //! sampled an episode, or when.
 
+use std::cell::Cell;
 use std::path::PathBuf;
 use std::time::Instant;
 
@@ -67,17 +68,17 @@ struct State {
 }
 
 /// Where the time of an epoch goes.
-struct Laps(Instant);
+struct Laps(Cell<Instant>);
 
 impl Laps {
     fn begin() -> Self {
-        Self(Instant::now())
+        Self(Cell::new(Instant::now()))
     }
 
     /// What went by since the last lap's end went to `activity`.
-    fn end(&mut self, activity: &'static str) {
-        let began = std::mem::replace(&mut self.0, Instant::now());
-        let seconds = (self.0 - began).as_secs_f64();
+    fn end(&self, activity: &'static str) {
+        let now = Instant::now();
+        let seconds = (now - self.0.replace(now)).as_secs_f64();
         gauge!("popgym_learner_activity_seconds_total", "activity" => activity).increment(seconds);
     }
 }
@@ -168,8 +169,12 @@ impl Trainer<'_> {
     /// One epoch. False: interrupted, and the state is that before the epoch.
     fn epoch(&mut self, state: &mut State) -> anyhow::Result<bool> {
         let began = Instant::now();
-        let mut laps = Laps::begin();
-        let stop = || self.interrupt.requested() || self.hopeless.is_set();
+        let laps = Laps::begin();
+        // Both long activities are counted while they last.
+        let stop = || {
+            laps.end("waiting");
+            self.interrupt.requested() || self.hopeless.is_set()
+        };
         let Some(collected) = self.service.collect(stop) else {
             anyhow::ensure!(!self.hopeless.is_set(), "local actors fail again and again; see their messages above");
             anyhow::ensure!(self.interrupt.requested(), "the service for actors has died");
@@ -205,7 +210,10 @@ impl Trainer<'_> {
             (&batch, &old),
             (&self.config.ppo, schedule),
             &mut stream(self.config.seed, epoch, 0, Purpose::Shuffle),
-            &|| self.interrupt.requested(),
+            &|| {
+                laps.end("learning");
+                self.interrupt.requested()
+            },
         );
         let means = match means {
             Ok(means) => means,

@@ -2,6 +2,7 @@
 
 use std::path::Path;
 
+use popgym_proto::monitor;
 use tch::Device;
 
 use super::{Failure, Outcome, say};
@@ -135,9 +136,14 @@ fn carry_out(
         hopeless: session.hopeless(),
     };
     let summary = trainer.run(checkpoint)?;
-    let interrupted = summary.stopped_by == "interrupt";
-    session.end(if interrupted { None } else { Some("the run is complete") });
-    Ok(if interrupted { interrupt.exit_status() } else { 0 })
+    if !summary.is_complete() {
+        session.end(None);
+        return Ok(interrupt.exit_status());
+    }
+    session.end(Some("the run is complete"));
+    // Else Prometheus would know a run that went away before its end.
+    monitor::wait_for_scrape();
+    Ok(0)
 }
 
 fn observers(

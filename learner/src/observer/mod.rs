@@ -158,6 +158,13 @@ pub struct Summary {
     pub stopped_by: String,
 }
 
+impl Summary {
+    /// Whether the run has come to its own end.
+    pub fn is_complete(&self) -> bool {
+        self.stopped_by != "interrupt"
+    }
+}
+
 /// Receives a run's events. Every method has an empty default.
 ///
 /// An error is reported and the run goes on: what was computed is never lost for a full disk.

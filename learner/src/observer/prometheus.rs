@@ -6,7 +6,7 @@ use std::time::{SystemTime, UNIX_EPOCH};
 use anyhow::Context as _;
 use metrics::{Unit, counter, describe_counter, describe_gauge, describe_histogram, gauge, histogram};
 
-use super::{EpochReport, Observer, RunStart};
+use super::{EpochReport, Observer, RunStart, Summary};
 
 /// Sets the metrics `popgym_learner_...` after every epoch.
 #[derive(Default)]
@@ -25,6 +25,7 @@ impl Prometheus {
     pub fn describe() {
         describe_gauge!("popgym_learner_run_info", "What is trained, in labels; always 1.");
         describe_gauge!("popgym_learner_target_steps", Unit::Count, "Environment steps after which the run stops.");
+        describe_gauge!("popgym_learner_complete", "1 when the run has come to its end, else 0.");
         describe_counter!("popgym_learner_epochs_total", Unit::Count, "Epochs completed.");
         describe_counter!("popgym_learner_passes_total", Unit::Count, "Passes over a batch, this session.");
         describe_counter!(
@@ -93,6 +94,7 @@ impl Observer for Prometheus {
         )
         .set(1.0);
         gauge!("popgym_learner_target_steps").set(start.total_steps as f64);
+        gauge!("popgym_learner_complete").set(0.0);
         counter!("popgym_learner_epochs_total").absolute(start.epoch);
         gauge!("popgym_learner_weights_version").set(start.epoch as f64);
         counter!("popgym_learner_env_steps_total").absolute(start.env_steps);
@@ -135,6 +137,11 @@ impl Observer for Prometheus {
         checkpointed();
         Ok(())
     }
+
+    fn run_end(&mut self, summary: &Summary) -> anyhow::Result<()> {
+        gauge!("popgym_learner_complete").set(f64::from(u8::from(summary.is_complete())));
+        Ok(())
+    }
 }
 
 fn checkpointed() {
@@ -146,7 +153,7 @@ fn checkpointed() {
 mod tests {
     use metrics_exporter_prometheus::PrometheusBuilder;
 
-    use super::super::samples::{report, start};
+    use super::super::samples::{report, start, summary};
     use super::*;
 
     /// What a scrape returns after a resumed run's epochs 3 and 4.
@@ -158,6 +165,7 @@ mod tests {
             observer.run_start(&start(Path::new("/"), 3)).unwrap();
             observer.epoch(&report(3)).unwrap();
             observer.epoch(&report(4)).unwrap();
+            observer.run_end(&summary(5)).unwrap();
         });
         recorder.handle().render()
     }
@@ -169,6 +177,7 @@ mod tests {
             "popgym_learner_run_info{env=\"RepeatPreviousEasy\",memory=\"GRU\",preset=\"paper\",seed=\"0\"} 1",
             "# TYPE popgym_learner_env_steps_total counter",
             "popgym_learner_env_steps_total 5000",
+            "popgym_learner_complete 1",
             "popgym_learner_epochs_total 5",
             "popgym_learner_weights_version 5",
             "popgym_learner_episodes_total 50",
@@ -195,6 +204,6 @@ mod tests {
             names
         };
         assert_eq!(words("# HELP "), words("# TYPE "));
-        assert_eq!(words("# TYPE ").len(), 29);
+        assert_eq!(words("# TYPE ").len(), 30);
     }
 }

@@ -2,7 +2,19 @@
 
 use metrics::{counter, describe_counter, describe_gauge, gauge};
 
-/// Names and explains every metric of the service.
+/// Why connections and requests are refused.
+const CONNECTION_REASONS: [&str; 7] = ["full", "rate", "tls", "http2", "token", "deadline", "flood"];
+
+/// Why sessions are refused or ended.
+const SESSION_REASONS: [&str; 9] =
+    ["full", "second", "handshake", "silent", "unread", "overdue", "illegal", "heartbeats", "excess"];
+
+/// Why episodes are refused, and messages.
+const EPISODE_REASONS: [&str; 9] =
+    ["late", "unleased", "version", "excess", "missing", "value", "length", "element", "encoding"];
+
+/// Names and explains every metric of the service. What is rare is 0 from the start: Prometheus sees no increase from nothing
+/// to 1.
 pub(super) fn describe() {
     describe_gauge!("popgym_learner_actors", "Actors that are connected and ready");
     describe_gauge!("popgym_learner_actors_sampling", "Of these, actors that hold leases");
@@ -41,6 +53,21 @@ pub(super) fn describe() {
     describe_counter!("popgym_learner_sent_bytes_total", "Bytes of weights sent");
     describe_gauge!("popgym_learner_event_queue", "Events of sessions that wait for the coordinator");
     describe_gauge!("popgym_learner_leases_outstanding", "Episodes leased and not received");
+
+    for reason in CONNECTION_REASONS {
+        counter!("popgym_learner_connections_refused_total", "reason" => reason).increment(0);
+    }
+    for reason in SESSION_REASONS {
+        counter!("popgym_learner_sessions_refused_total", "reason" => reason).increment(0);
+    }
+    for reason in EPISODE_REASONS {
+        refused(reason, 0);
+    }
+    leases_lost(0);
+    counter!("popgym_learner_account_failures_total").increment(0);
+    counter!("popgym_learner_reconnects_total").increment(0);
+    counter!("popgym_learner_episodes_accepted_total").increment(0);
+    counter!("popgym_learner_steps_accepted_total").increment(0);
 }
 
 pub(super) fn actors(count: usize) {
@@ -56,6 +83,7 @@ pub(super) fn connections(count: usize) {
 }
 
 pub(super) fn connection_refused(reason: &'static str) {
+    debug_assert!(CONNECTION_REASONS.contains(&reason), "{reason}");
     counter!("popgym_learner_connections_refused_total", "reason" => reason).increment(1);
 }
 
@@ -77,6 +105,7 @@ pub(super) fn joined(returned: bool) {
 }
 
 pub(super) fn session_refused(reason: &'static str) {
+    debug_assert!(SESSION_REASONS.contains(&reason), "{reason}");
     counter!("popgym_learner_sessions_refused_total", "reason" => reason).increment(1);
 }
 
@@ -90,6 +119,7 @@ pub(super) fn accepted(steps: usize) {
 }
 
 pub(super) fn refused(reason: &'static str, episodes: usize) {
+    debug_assert!(EPISODE_REASONS.contains(&reason), "{reason}");
     counter!("popgym_learner_episodes_refused_total", "reason" => reason).increment(episodes as u64);
 }
 
