@@ -272,7 +272,7 @@ strike_learner() {
     began=$SECONDS
     compose stop learner >/dev/null 2>&1
     say "the learner is stopped, in $((SECONDS - began)) s"
-    [[ $(inspect "$learner" '{{.State.Running}} {{.State.ExitCode}}') == "false 0" ]] ||
+    [[ $(inspect "$learner" '{{.State.Running}} {{.State.ExitCode}}') == "false 143" ]] ||
         fail "stopped, it ended with $(inspect "$learner" '{{.State.ExitCode}}')"
     wait_for 120 "Prometheus to see that it is gone" asked 'up{job="learner"}' -eq 0
     say "make up again"

@@ -101,7 +101,7 @@ impl Trainer<'_> {
                 Err(error) => {
                     let _ = self.save(&mut state);
                     // What went wrong is in the metrics.
-                    monitor::wait_for_scrape();
+                    monitor::wait_for_scrape(|| self.interrupt.requested());
                     return Err(error);
                 }
             }

@@ -10,7 +10,7 @@
 
 use std::net::{SocketAddr, TcpListener};
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::{Arc, Condvar, Mutex, PoisonError};
+use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
 use axum::Router;
@@ -35,7 +35,6 @@ static READY: AtomicBool = AtomicBool::new(false);
 
 /// When the metrics were last asked for, and how long after the time before.
 static SCRAPED: Mutex<Option<(Instant, Duration)>> = Mutex::new(None);
-static SCRAPE: Condvar = Condvar::new();
 
 /// Whether the program can do its work from now on: a learner is open to actors, an actor has a session.
 pub fn set_ready(ready: bool) {
@@ -43,19 +42,20 @@ pub fn set_ready(ready: bool) {
 }
 
 /// Waits until the metrics are asked for once more, where somebody does so regularly: for what is known only at the end.
-pub fn wait_for_scrape() {
-    let scraped = SCRAPED.lock().unwrap_or_else(PoisonError::into_inner);
-    let Some((last, interval)) = *scraped else { return };
-    let wait = (interval + interval / 2).min(LONGEST_WAIT).saturating_sub(last.elapsed());
-    let since = |scraped: &mut Option<(Instant, Duration)>| scraped.is_some_and(|(at, _)| at == last);
-    drop(SCRAPE.wait_timeout_while(scraped, wait, since));
+/// `interrupted` is asked ten times a second.
+pub fn wait_for_scrape(interrupted: impl Fn() -> bool) {
+    let last_scrape = || *SCRAPED.lock().unwrap_or_else(PoisonError::into_inner);
+    let Some((last, interval)) = last_scrape() else { return };
+    let until = last + (interval + interval / 2).min(LONGEST_WAIT);
+    while last_scrape().is_some_and(|(at, _)| at == last) && Instant::now() < until && !interrupted() {
+        std::thread::sleep(Duration::from_millis(100));
+    }
 }
 
 fn scraped() {
     let mut scraped = SCRAPED.lock().unwrap_or_else(PoisonError::into_inner);
     let now = Instant::now();
     *scraped = Some((now, scraped.map_or(Duration::ZERO, |(last, _)| now - last)));
-    SCRAPE.notify_all();
 }
 
 /// Makes this process's metrics known and serves them at `address`, with `pages`, from a thread of its own; once a process.

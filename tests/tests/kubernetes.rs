@@ -113,7 +113,9 @@ fn agreement<'a>(objects: &'a [Value], of_users: &BTreeMap<String, BTreeSet<Stri
         {
             let get = &job.container[probe]["httpGet"];
             let right = *get == json!({ "path": path, "port": "metrics" }) && job.port("metrics").is_some();
-            expect(right || job.flag("--metrics-listen").is_none(), &format!("{probe} is not for {path}"));
+            // A study is no service: its trials come and go.
+            let served = job.flag("--metrics-listen").is_some() && !job.args().starts_with(&["study", "run"]);
+            expect(right || !served, &format!("{probe} is not for {path}"));
         }
         let paths = job.args().into_iter().map(|arg| arg.split_once('=').map_or(arg, |(_, value)| value));
         let mut paths: Vec<&str> = paths.filter(|path| path.starts_with('/')).collect();
@@ -235,10 +237,10 @@ fn all_manifests_are_valid_and_of_one_piece() {
     let own = kustomize::render(&copy.path().join("kubernetes/my-run")).unwrap();
     assert_eq!(problems(&own), none, "the README's");
     assert_ne!(own, render("train"), "the README's");
-    // The monitor sees both programs.
-    let (train, monitoring) = (render("train"), render("monitoring"));
+    // The monitor sees the programs of a run, and trials.
+    let (train, study, monitoring) = (render("train"), render("study"), render("monitoring"));
     let (selector, endpoints) = (&monitoring[0]["spec"]["selector"], &monitoring[0]["spec"]["podMetricsEndpoints"]);
-    for job in Job::all(&train) {
+    for job in Job::all(&train).into_iter().chain(Job::all(&study)) {
         assert!(job.is_selected(&selector["matchLabels"]), "{}", job.name);
         assert_eq!(selector["matchExpressions"][0]["key"], "app.kubernetes.io/component");
         assert!(list(&selector["matchExpressions"][0]["values"]).contains(&json!(job.name)));

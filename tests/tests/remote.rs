@@ -61,6 +61,12 @@ fn an_actor_may_be_there_before_its_learner() {
     let learner = scene.train("run", &["--actors", "0", "--listen", &address]);
     actor.expect(0);
     learner.expect(0);
+    // The same again, as whatever starts both may do: there is nothing left for either.
+    let actor = scene.actor(&address, &[]);
+    let learner = scene.train("run", &["--actors", "0", "--listen", &address, "--continue"]);
+    actor.expect(0);
+    let outcome = learner.expect(0);
+    assert!(outcome.stdout.contains("already complete"), "{}", outcome.stdout);
 }
 
 #[test]

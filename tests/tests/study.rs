@@ -2,8 +2,9 @@
 
 use std::collections::BTreeSet;
 use std::fs;
+use std::net::TcpListener;
 
-use popgym_tests::{Process, Scene, until};
+use popgym_tests::{Process, Scene, net, until};
 use rustix::process::Signal;
 use serde_json::Value;
 
@@ -173,13 +174,28 @@ fn a_killed_study_loses_nothing_and_does_nothing_twice() {
     }
 }
 
+/// A port that is free, and so is the one after it.
+fn two_ports() -> (u16, u16) {
+    until("two ports", || {
+        let port: u16 = net::free_address().rsplit_once(':')?.1.parse().ok()?;
+        let next = port.checked_add(1)?;
+        TcpListener::bind(("127.0.0.1", next)).ok()?;
+        Some((port, next))
+    })
+}
+
 #[test]
 fn an_interrupted_study_saves_and_goes_on() {
     let scene = scene(&STUDY.replace("steps = 2048", "steps = 200000"));
-    let mut study = run(&scene, &["--jobs", "2"]);
+    let (first_port, second_port) = two_ports();
+    let mut study = run(&scene, &["--jobs", "2", "--metrics-listen", &first_port.to_string()]);
     until("two trials", || (runs(&scene).len() >= 2).then_some(()));
     let first = "study/trials/0000-RepeatFirstEasy-mlp-seed3";
     scene.reached(&mut study, first, 3);
+    for (port, memory) in [(first_port, "MLP"), (second_port, "GRU")] {
+        let info = format!("popgym_learner_run_info{{env=\"RepeatFirstEasy\",memory=\"{memory}\"");
+        net::get(&format!("127.0.0.1:{port}"), "/metrics", &[&info]);
+    }
     study.signal(Signal::TERM);
     let outcome = study.expect(130);
     assert!(outcome.stdout.contains("0 of 6 trials done, 6 left"), "{}", outcome.stdout);
@@ -251,6 +267,15 @@ fn bad_input_is_told() {
     };
     bad(&["study", "run", "study.toml", "--out", "study", "--index", "6"], &["--index is 6", "0 to 5"]);
     bad(&["study", "run", "study.toml", "--out", "study", "--jobs", "0"], &["--jobs", "0"]);
+    bad(
+        &["study", "run", "study.toml", "--out", "study", "--metrics-listen", "0"],
+        &["--metrics-listen is `0`", "1 to 65535"],
+    );
+    let metrics = ["--jobs", "3", "--metrics-listen", "65534"];
+    bad(
+        &[&["study", "run", "study.toml", "--out", "study"], &metrics[..]].concat(),
+        &["`65534`", "3 trials at a time"],
+    );
     bad(&["study", "run", "none.toml", "--out", "study"], &["none.toml"]);
     bad(&["study", "list", "tiny.toml"], &["tiny.toml", "checkpoint_epochs"]);
     assert!(!scene.path("study").exists(), "nothing was begun");

@@ -1,9 +1,11 @@
 //! `learner study run` and `learner study list`.
 
 use std::fmt::Write as _;
+use std::net::SocketAddr;
 use std::path::PathBuf;
 
 use anyhow::anyhow;
+use popgym_proto::transport::metrics_address;
 use serde_json::json;
 
 use super::{Failure, Outcome, say};
@@ -28,6 +30,10 @@ pub struct StudyRunArgs {
     /// Run this trial only (`learner study list`), as a task of a Slurm array or an indexed job does; exits 0 only if it is done
     #[arg(long, value_name = "K", conflicts_with = "jobs")]
     pub index: Option<usize>,
+    /// Address of a trial for Prometheus: PORT, for this machine alone, or IP:PORT; of those at a time, each has the port after
+    /// the other's [default: none]
+    #[arg(long, value_name = "ADDR")]
+    pub metrics_listen: Option<String>,
     /// Try those again, too, that have failed three times
     #[arg(long)]
     pub retry_failed: bool,
@@ -81,18 +87,31 @@ pub fn study_run(args: &StudyRunArgs, extensions: &Extensions) -> Outcome {
             return Err(Failure::Usage(anyhow!("--index is {index}, allowed is 0 to {allowed}: the study's trials")));
         }
     };
+    let cores = std::thread::available_parallelism().map_or(1, std::num::NonZero::get);
+    let jobs = args.jobs.map_or(cores, |jobs| jobs as usize).min(wanted.len());
+    let metrics = args.metrics_listen.as_deref().map(|address| metrics_addresses(address, jobs)).transpose();
+    let metrics = metrics.map_err(Failure::Usage)?;
     let dir = StudyDir::open(&args.out, &text, &trials, extensions).map_err(Failure::Usage)?;
     if args.retry_failed {
         wanted.iter().try_for_each(|trial| dir.forget_failures(trial))?;
     }
     let interrupt = Interrupt::listen(None)?;
-    let cores = std::thread::available_parallelism().map_or(1, std::num::NonZero::get);
-    let jobs = args.jobs.map_or(cores, |jobs| jobs as usize);
-    let tally = Runner::new(&dir, wanted, &interrupt).run(jobs)?;
+    let tally = Runner::new(&dir, wanted, &interrupt, metrics).run(jobs)?;
     say(&describe(tally, wanted, &dir))?;
     // A task of an array has not done its work while another process is at it.
     let missing = tally.failed > 0 || (args.index.is_some() && tally.elsewhere > 0);
     Ok(if tally.left > 0 { EXIT_INTERRUPTED } else { u8::from(missing) })
+}
+
+/// The first of as many addresses as there are trials at a time.
+fn metrics_addresses(text: &str, jobs: usize) -> anyhow::Result<SocketAddr> {
+    let first = metrics_address(text).map_err(anyhow::Error::msg)?;
+    let last = usize::from(first.port()) + jobs.saturating_sub(1);
+    anyhow::ensure!(
+        first.port() != 0 && last <= usize::from(u16::MAX),
+        "--metrics-listen is `{text}`, allowed is a port of 1 to 65535 with room above it for {jobs} trials at a time"
+    );
+    Ok(first)
 }
 
 fn describe(tally: Tally, trials: &[Trial], dir: &StudyDir) -> String {

@@ -1,6 +1,7 @@
 //! `learner train` and `learner resume`.
 
 use std::path::Path;
+use std::time::{Duration, Instant};
 
 use popgym_proto::monitor;
 use tch::Device;
@@ -19,6 +20,9 @@ use crate::observer::{
 use crate::run_dir::{self, RunDir};
 use crate::session::Session;
 use crate::trainer::Trainer;
+
+/// How long the actors of a run that was complete before may take to hear of it: more than their start does.
+const LATECOMERS: Duration = Duration::from_secs(10);
 
 /// Trains an agent in a new run directory, or continues one where `--continue` allows it.
 ///
@@ -112,6 +116,9 @@ fn carry_out(
 ) -> Outcome {
     if run_dir::finished(dir.path(), config).is_some() {
         say(&format!("already complete: {}", dir.path().join(SummaryJson::FILE).display()))?;
+        if config.service.actors == 0 {
+            tell_latecomers(dir, session, interrupt)?;
+        }
         return Ok(0);
     }
     let rows = MetricsCsv::read(dir.path()).map_or(0, |rows| rows.len() as u64);
@@ -142,8 +149,19 @@ fn carry_out(
     }
     session.end(Some("the run is complete"));
     // Else Prometheus would know a run that went away before its end.
-    monitor::wait_for_scrape();
+    monitor::wait_for_scrape(|| interrupt.requested());
     Ok(0)
+}
+
+/// Tells remote actors that were started for a complete run that there is nothing to do. They would wait for a learner.
+fn tell_latecomers(dir: &RunDir, mut session: Session<'_>, interrupt: &Interrupt) -> anyhow::Result<()> {
+    session.serve(dir.run(), Purpose::Training, None)?;
+    let until = Instant::now() + LATECOMERS;
+    while Instant::now() < until && !interrupt.requested() {
+        std::thread::sleep(Duration::from_millis(100));
+    }
+    session.end(Some("the run is complete"));
+    Ok(())
 }
 
 fn observers(

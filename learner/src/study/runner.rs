@@ -2,6 +2,7 @@
 
 use std::collections::VecDeque;
 use std::fs::{self, File};
+use std::net::SocketAddr;
 use std::os::unix::process::CommandExt as _;
 use std::path::Path;
 use std::process::{Child, Command, ExitStatus, Stdio};
@@ -35,6 +36,8 @@ pub struct Tally {
 pub struct Runner<'a> {
     dir: &'a StudyDir,
     interrupt: &'a Interrupt,
+    /// Where the first of the trials that run serves its metrics.
+    metrics: Option<SocketAddr>,
     view: View<'a>,
     queue: VecDeque<&'a Trial>,
     running: Vec<Running<'a>>,
@@ -44,6 +47,8 @@ pub struct Runner<'a> {
 /// A trial that this process has claimed.
 struct Running<'a> {
     trial: &'a Trial,
+    /// Its place among those that run, from 0.
+    place: usize,
     /// None: the learner of an earlier session has still to end.
     child: Option<Child>,
     /// Length of the trial's log when the child was started.
@@ -52,8 +57,13 @@ struct Running<'a> {
 }
 
 impl<'a> Runner<'a> {
-    /// A runner of `trials`.
-    pub fn new(dir: &'a StudyDir, trials: impl IntoIterator<Item = &'a Trial>, interrupt: &'a Interrupt) -> Self {
+    /// A runner of `trials`. Those that run at a time serve their metrics at the address `metrics` and the ports after it.
+    pub fn new(
+        dir: &'a StudyDir,
+        trials: impl IntoIterator<Item = &'a Trial>,
+        interrupt: &'a Interrupt,
+        metrics: Option<SocketAddr>,
+    ) -> Self {
         let (mut queue, mut tally) = (VecDeque::new(), Tally::default());
         for trial in trials {
             match dir.standing(trial) {
@@ -63,7 +73,7 @@ impl<'a> Runner<'a> {
             }
         }
         let view = View::new(dir, queue.iter().copied());
-        Self { dir, interrupt, view, queue, running: Vec::new(), tally }
+        Self { dir, interrupt, metrics, view, queue, running: Vec::new(), tally }
     }
 
     /// Runs the trials that are not done, `jobs` at a time, until none is left or the user stops; then waits until those
@@ -103,7 +113,9 @@ impl<'a> Runner<'a> {
             Standing::Done => self.tally.done += 1,
             Standing::Failed => self.tally.failed += 1,
             Standing::Begun | Standing::Fresh => {
-                self.running.push(Running { trial, child: None, said_before: 0, _claim: claim });
+                let taken = |place: &usize| self.running.iter().any(|running| running.place == *place);
+                let place = (0..).find(|place| !taken(place)).unwrap_or_default();
+                self.running.push(Running { trial, place, child: None, said_before: 0, _claim: claim });
                 return Ok(true);
             }
         }
@@ -116,7 +128,9 @@ impl<'a> Runner<'a> {
             let Some(child) = &mut running.child else {
                 if !self.dir.is_occupied(running.trial) {
                     running.said_before = fs::metadata(self.dir.log(running.trial)).map_or(0, |log| log.len());
-                    running.child = Some(start(self.dir, running.trial)?);
+                    let metrics =
+                        self.metrics.map(|first| SocketAddr::new(first.ip(), first.port() + running.place as u16));
+                    running.child = Some(start(self.dir, running.trial, metrics)?);
                 }
                 self.running.push(running);
                 continue;
@@ -169,7 +183,7 @@ impl<'a> Runner<'a> {
 }
 
 /// Starts `train --continue` of a trial. It ends by itself, saving what it has, when this process does.
-fn start(dir: &StudyDir, trial: &Trial) -> anyhow::Result<Child> {
+fn start(dir: &StudyDir, trial: &Trial, metrics: Option<SocketAddr>) -> anyhow::Result<Child> {
     let config = dir.write_config(trial)?;
     let path = dir.log(trial);
     let log = File::options().create(true).append(true).open(&path);
@@ -177,6 +191,9 @@ fn start(dir: &StudyDir, trial: &Trial) -> anyhow::Result<Child> {
     let program = std::env::current_exe().context("this program's own file is unknown")?;
     let mut command = Command::new(&program);
     command.args(["train", "--with-parent", "--continue", "--config"]).arg(config).arg("--out").arg(dir.run(trial));
+    if let Some(address) = metrics {
+        command.arg("--metrics-listen").arg(address.to_string());
+    }
     command.stdin(Stdio::piped()).stdout(log.try_clone()?).stderr(log);
     // Ctrl-C in a terminal goes to its whole process group. It is this process that decides what it means.
     command.process_group(0);
