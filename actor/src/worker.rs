@@ -1,8 +1,11 @@
 //! The thread of libtorch: takes what the session hears, hands back episodes.
 
+use std::time::Duration;
+
 use popgym_envs::Registry;
 use popgym_models::memory;
 use popgym_proto::{ActorMessage, Episode, EpisodeBatch, Fingerprint, Leases, OpenEpoch, RunSpec, limits, wire};
+use tokio::runtime::Runtime;
 use tokio::sync::{mpsc, oneshot};
 use tracing::info;
 
@@ -11,6 +14,9 @@ use crate::rollout::Rollout;
 
 /// Commands that wait for the worker. It looks between two steps, milliseconds apart.
 const COMMAND_QUEUE: usize = 64;
+
+/// An idle worker says so this often.
+const IDLE_INTERVAL: Duration = Duration::from_secs(1);
 
 /// What the session tells the worker.
 #[derive(Debug)]
@@ -59,10 +65,11 @@ impl Worker {
     /// If the system refuses a thread.
     pub fn spawn(envs: Registry, memories: memory::Registry, slots: u32) -> std::io::Result<Self> {
         let (commands, inbox) = mpsc::channel(COMMAND_QUEUE);
+        let clock = tokio::runtime::Builder::new_current_thread().enable_time().build()?;
         let thread = std::thread::Builder::new().name("rollout".to_owned()).spawn(move || {
             // One core an actor: more actors, not more threads. libtorch keeps this by thread, so it is set here.
             tch::set_num_threads(1);
-            State { envs, memories, slots, rollout: None, outputs: None, finished: Vec::new() }.run(inbox);
+            State { envs, memories, slots, rollout: None, outputs: None, finished: Vec::new() }.run(inbox, &clock);
         })?;
         Ok(Self { commands, thread })
     }
@@ -95,7 +102,7 @@ struct State {
 }
 
 impl State {
-    fn run(mut self, mut inbox: mpsc::Receiver<Command>) {
+    fn run(mut self, mut inbox: mpsc::Receiver<Command>, clock: &Runtime) {
         loop {
             while let Ok(command) = inbox.try_recv() {
                 self.handle(command);
@@ -107,11 +114,15 @@ impl State {
                 }
                 continue;
             }
-            let Some(command) = inbox.blocking_recv() else { return };
+            let command = clock.block_on(async { tokio::time::timeout(IDLE_INTERVAL, inbox.recv()).await });
             if let Some(rollout) = &mut self.rollout {
                 rollout.tally.lap(Activity::Idle);
             }
-            self.handle(command);
+            match command {
+                Ok(Some(command)) => self.handle(command),
+                Ok(None) => return,
+                Err(_) => {}
+            }
         }
     }
 

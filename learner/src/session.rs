@@ -103,11 +103,14 @@ impl<'a> Session<'a> {
         Ok(policy)
     }
 
-    /// Takes the addresses that the run needs, and looks for the program of the local actors.
+    /// Takes the addresses that the run needs, and looks for the program of the local actors; once.
     ///
     /// # Errors
     /// An address that cannot be had, or no such program.
     pub fn listen(&mut self) -> anyhow::Result<()> {
+        if !self.entrances.is_empty() {
+            return Ok(());
+        }
         let service = &self.config.service;
         if service.actors > 0 {
             self.actor_command()?;
@@ -133,9 +136,7 @@ impl<'a> Session<'a> {
     /// # Errors
     /// As [`Session::listen`], if that was not called before; or the actors cannot be started.
     pub fn serve(&mut self, run: &str, purpose: config::Purpose, account: Option<&Path>) -> anyhow::Result<()> {
-        if self.entrances.is_empty() {
-            self.listen()?;
-        }
+        self.listen()?;
         let entrances = std::mem::take(&mut self.entrances);
         let local = entrances.last().context("no listening address")?.listener.local_addr()?;
         let spec = self.config.run_spec(run, purpose)?;

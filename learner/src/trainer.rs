@@ -106,10 +106,12 @@ impl Trainer<'_> {
                 }
             }
         };
-        let saved = self.save(&mut state);
+        if !self.save(&mut state) {
+            monitor::wait_for_scrape(|| self.interrupt.requested());
+            anyhow::bail!("the run ended, but its last checkpoint could not be written");
+        }
         let summary = self.summary(&state, stopped_by);
         self.tell(|observer| observer.run_end(&summary));
-        anyhow::ensure!(saved, "the run ended, but its last checkpoint could not be written");
         Ok(summary)
     }
 

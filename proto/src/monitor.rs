@@ -14,7 +14,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
 use axum::Router;
-use axum::http::{StatusCode, header};
+use axum::http::{HeaderMap, StatusCode, header};
 use axum::routing::get;
 use hyper::server::conn::http1;
 use hyper_util::rt::{TokioIo, TokioTimer};
@@ -28,12 +28,21 @@ use crate::limits;
 /// How often distributions that nobody scrapes are made smaller.
 const UPKEEP_INTERVAL: Duration = Duration::from_secs(5);
 
-/// No program waits longer than this for one more scrape.
-const LONGEST_WAIT: Duration = Duration::from_mins(1);
+/// Prometheus' own interval, for as long as there has been one scrape only. No program waits much longer for one more.
+const SCRAPE_INTERVAL: Duration = Duration::from_mins(1);
+
+/// What a scrape may be late.
+const SCRAPE_SLACK: Duration = Duration::from_secs(10);
+
+/// A header that Prometheus sends, and those who scrape in its place; nobody who only has a look does.
+const SCRAPER: &str = "x-prometheus-scrape-timeout-seconds";
+
+/// Limits of the buckets of durations, in seconds.
+const BUCKETS: [f64; 13] = [0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 25.0, 50.0, 100.0, 250.0, 500.0, 1000.0];
 
 static READY: AtomicBool = AtomicBool::new(false);
 
-/// When the metrics were last asked for, and how long after the time before.
+/// When the metrics were last scraped, and the longest time between two scrapes.
 static SCRAPED: Mutex<Option<(Instant, Duration)>> = Mutex::new(None);
 
 /// Whether the program can do its work from now on: a learner is open to actors, an actor has a session.
@@ -41,21 +50,27 @@ pub fn set_ready(ready: bool) {
     READY.store(ready, Ordering::Relaxed);
 }
 
-/// Waits until the metrics are asked for once more, where somebody does so regularly: for what is known only at the end.
+/// Waits until the metrics are scraped once more, where they are scraped at all: for what is known only at the end.
 /// `interrupted` is asked ten times a second.
 pub fn wait_for_scrape(interrupted: impl Fn() -> bool) {
     let last_scrape = || *SCRAPED.lock().unwrap_or_else(PoisonError::into_inner);
     let Some((last, interval)) = last_scrape() else { return };
-    let until = last + (interval + interval / 2).min(LONGEST_WAIT);
-    while last_scrape().is_some_and(|(at, _)| at == last) && Instant::now() < until && !interrupted() {
+    let interval = if interval.is_zero() { SCRAPE_INTERVAL } else { interval.min(SCRAPE_INTERVAL) };
+    let until = last + interval + SCRAPE_SLACK;
+    while Instant::now() < until && !interrupted() {
         std::thread::sleep(Duration::from_millis(100));
+        if last_scrape().is_some_and(|(at, _)| at != last) {
+            // The answer is on its way.
+            std::thread::sleep(Duration::from_millis(500));
+            break;
+        }
     }
 }
 
 fn scraped() {
     let mut scraped = SCRAPED.lock().unwrap_or_else(PoisonError::into_inner);
     let now = Instant::now();
-    *scraped = Some((now, scraped.map_or(Duration::ZERO, |(last, _)| now - last)));
+    *scraped = Some((now, scraped.map_or(Duration::ZERO, |(last, longest)| longest.max(now - last))));
 }
 
 /// Makes this process's metrics known and serves them at `address`, with `pages`, from a thread of its own; once a process.
@@ -66,7 +81,8 @@ pub fn serve(address: SocketAddr, pages: Router) -> Result<(), String> {
     let problem = |error: &dyn std::fmt::Display| format!("cannot serve metrics at {address}: {error}");
     let listener = TcpListener::bind(address).map_err(|error| problem(&error))?;
     listener.set_nonblocking(true).map_err(|error| problem(&error))?;
-    let handle = PrometheusBuilder::new().install_recorder().map_err(|error| problem(&error))?;
+    let recorder = PrometheusBuilder::new().set_buckets(&BUCKETS).and_then(PrometheusBuilder::install_recorder);
+    let handle = recorder.map_err(|error| problem(&error))?;
     let process = Collector::default();
     process.describe();
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build();
@@ -91,10 +107,13 @@ pub fn serve(address: SocketAddr, pages: Router) -> Result<(), String> {
 }
 
 fn router(handle: PrometheusHandle, process: Collector) -> Router {
-    let metrics = move || {
+    let metrics = move |headers: HeaderMap| {
         process.collect();
-        scraped();
-        std::future::ready(([(header::CONTENT_TYPE, "text/plain; version=0.0.4")], typed_by_name(&handle.render())))
+        let text = typed_by_name(&handle.render());
+        if headers.contains_key(SCRAPER) {
+            scraped();
+        }
+        std::future::ready(([(header::CONTENT_TYPE, "text/plain; version=0.0.4")], text))
     };
     let ready = || async {
         if READY.load(Ordering::Relaxed) {

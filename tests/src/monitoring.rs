@@ -81,7 +81,7 @@ fn files(directory: &str, extension: &str) -> Vec<PathBuf> {
 /// A row of `deploy/metrics.md`.
 #[derive(Debug)]
 pub struct Listed {
-    /// `gauge`, `counter` or `summary`.
+    /// `gauge`, `counter` or `histogram`.
     pub kind: String,
     /// The labels' names, each with its values, where the list has them.
     pub labels: BTreeMap<String, BTreeSet<String>>,

@@ -52,6 +52,7 @@ fn served(text: &str) -> Served {
             && !line.starts_with('#')
         {
             let (labels, _) = rest.rsplit_once('}').unwrap();
+            let name = name.strip_suffix("_bucket").unwrap_or(name);
             let (_, known) = all.get_mut(name).unwrap_or_else(|| panic!("no type before `{line}`"));
             let keys = labels.split(',').map(|label| label.split_once('=').unwrap().0);
             for (key, value) in keys.zip(quoted(labels, '"')) {
@@ -107,8 +108,8 @@ fn what_is_asked_for_exists_and_what_exists_is_shown() {
     let mut known: BTreeSet<String> = ["up".to_owned()].into();
     for (name, metric) in &listed {
         known.insert(name.clone());
-        if metric.kind == "summary" {
-            known.extend(["_sum", "_count"].map(|suffix| format!("{name}{suffix}")));
+        if metric.kind == "histogram" {
+            known.extend(["_sum", "_count", "_bucket"].map(|suffix| format!("{name}{suffix}")));
         }
     }
     let recorded: BTreeSet<String> =
@@ -135,11 +136,16 @@ fn what_is_asked_for_exists_and_what_exists_is_shown() {
         }
     }
     for (rule, query) in rule_queries() {
-        asked.extend(check(&rule, &query));
+        let names = check(&rule, &query);
+        if shown.contains(&rule) {
+            shown.extend(names.clone());
+        }
+        asked.extend(names);
     }
     for name in listed.keys().filter(|name| name.starts_with("popgym_")) {
         // What is only there for its labels is shown by what it is joined to.
-        assert!(shown.contains(name), "no dashboard shows {name}");
+        let parts = shown.iter().any(|part| part.strip_prefix(name.as_str()) == Some("_bucket"));
+        assert!(shown.contains(name) || parts, "no dashboard shows {name}");
     }
     for name in &recorded {
         assert!(shown.contains(name) || asked.contains(name), "nobody uses {name}");
@@ -181,7 +187,8 @@ fn each_alert_says_what_to_do() {
         let name = alert["alert"].as_str().unwrap();
         assert!(named.insert(name), "{name} is there twice");
         assert!(["critical", "warning"].contains(&alert["labels"]["severity"].as_str().unwrap()), "{name}");
-        assert!(alert["annotations"]["summary"].as_str().unwrap().contains("{{ $labels.instance }}"), "{name}");
+        let summary = alert["annotations"]["summary"].as_str().unwrap();
+        assert!(summary.contains("{{ $labels.instance }}") || summary.contains("{{ $labels.env }}"), "{name}");
         let action = alert["annotations"]["action"].as_str().unwrap();
         assert!(action.ends_with(&format!(": deploy/metrics.md#{}", name.to_lowercase())), "{name}: {action}");
         assert!(cases.contains(&format!("alertname=\"{name}\"")), "no test makes {name} fire");

@@ -185,6 +185,7 @@ fn prometheus_watches_both_sides() {
         "run_info{env=\"popgym-RepeatPreviousEasy-v0\",memory=\"gru\",preset=\"quick\",seed=\"0\"} 1",
         "steps_per_second ",
         "env_steps_total ",
+        "run_steps ",
         "episodes_total ",
         "epochs_total ",
         "weights_version ",

@@ -121,6 +121,8 @@ fn carry_out(
         }
         return Ok(0);
     }
+    // Before the observers hear of the run: metrics are known from then on.
+    session.listen()?;
     let rows = MetricsCsv::read(dir.path()).map_or(0, |rows| rows.len() as u64);
     let checkpoint = Checkpoint::latest(&dir.checkpoints(), session.parameters(), rows)?;
     // What was asked for now is what the directory says from now on.
@@ -191,6 +193,7 @@ fn observers(
         seed: config.seed,
         epoch: epochs,
         env_steps: progress.map_or(0, |progress| progress.env_steps),
+        episodes: progress.map_or(0, |progress| progress.episodes),
         total_steps: config.steps,
         mmer: progress.and_then(|progress| progress.mmer),
     };

@@ -44,6 +44,8 @@ pub struct RunStart {
     pub epoch: u64,
     /// Environment steps already completed.
     pub env_steps: u64,
+    /// Episodes already completed.
+    pub episodes: u64,
     /// Steps after which the run stops.
     pub total_steps: u64,
     /// Largest epoch mean return so far (resumed runs).

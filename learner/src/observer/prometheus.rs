@@ -13,6 +13,9 @@ use super::{EpochReport, Observer, RunStart, Summary};
 pub struct Prometheus {
     /// The run directory.
     dir: PathBuf,
+    /// Steps and episodes of the run so far.
+    env_steps: u64,
+    episodes: u64,
 }
 
 impl Prometheus {
@@ -26,7 +29,7 @@ impl Prometheus {
         describe_gauge!("popgym_learner_run_info", "What is trained, in labels; always 1.");
         describe_gauge!("popgym_learner_target_steps", Unit::Count, "Environment steps after which the run stops.");
         describe_gauge!("popgym_learner_complete", "1 when the run has come to its end, else 0.");
-        describe_counter!("popgym_learner_epochs_total", Unit::Count, "Epochs completed.");
+        describe_counter!("popgym_learner_epochs_total", Unit::Count, "Epochs completed, this session.");
         describe_counter!("popgym_learner_passes_total", Unit::Count, "Passes over a batch, this session.");
         describe_counter!(
             "popgym_learner_nonfinite_updates_total",
@@ -45,10 +48,26 @@ impl Prometheus {
         );
         describe_gauge!("popgym_learner_disk_free_bytes", Unit::Bytes, "Free space where the run directory is.");
         describe_gauge!("popgym_learner_weights_version", Unit::Count, "Epochs of training in the newest weights.");
-        describe_counter!("popgym_learner_env_steps_total", Unit::Count, "Environment steps of completed epochs.");
-        describe_counter!("popgym_learner_episodes_total", Unit::Count, "Episodes of completed epochs.");
+        describe_counter!(
+            "popgym_learner_env_steps_total",
+            Unit::Count,
+            "Steps of the epochs completed, this session."
+        );
+        describe_gauge!(
+            "popgym_learner_run_steps",
+            Unit::Count,
+            "Environment steps of the run, earlier sessions included."
+        );
+        describe_counter!(
+            "popgym_learner_episodes_total",
+            Unit::Count,
+            "Episodes of the epochs completed, this session."
+        );
         describe_counter!("popgym_learner_surplus_steps_total", Unit::Count, "Steps sampled and thrown away.");
-        describe_gauge!("popgym_learner_return_mean", "Mean return of the last epoch's episodes.");
+        describe_gauge!(
+            "popgym_learner_return_mean",
+            "Mean return of the last epoch's episodes, or of the last 100 if it has fewer."
+        );
         describe_gauge!("popgym_learner_return_min", "Smallest return of the last epoch.");
         describe_gauge!("popgym_learner_return_max", "Largest return of the last epoch.");
         describe_gauge!("popgym_learner_return_mmer", "Largest mean return of an epoch so far.");
@@ -82,6 +101,7 @@ impl Prometheus {
 impl Observer for Prometheus {
     fn run_start(&mut self, start: &RunStart) -> anyhow::Result<()> {
         self.dir.clone_from(&start.dir);
+        (self.env_steps, self.episodes) = (start.env_steps, start.episodes);
         checkpointed();
         counter!("popgym_learner_nonfinite_updates_total").increment(0);
         counter!("popgym_learner_checkpoint_failures_total").increment(0);
@@ -95,9 +115,11 @@ impl Observer for Prometheus {
         .set(1.0);
         gauge!("popgym_learner_target_steps").set(start.total_steps as f64);
         gauge!("popgym_learner_complete").set(0.0);
-        counter!("popgym_learner_epochs_total").absolute(start.epoch);
+        counter!("popgym_learner_epochs_total").increment(0);
+        counter!("popgym_learner_env_steps_total").increment(0);
+        counter!("popgym_learner_episodes_total").increment(0);
         gauge!("popgym_learner_weights_version").set(start.epoch as f64);
-        counter!("popgym_learner_env_steps_total").absolute(start.env_steps);
+        gauge!("popgym_learner_run_steps").set(start.env_steps as f64);
         if let Some(mmer) = start.mmer {
             gauge!("popgym_learner_return_mmer").set(mmer);
         }
@@ -105,10 +127,13 @@ impl Observer for Prometheus {
     }
 
     fn epoch(&mut self, EpochReport { metrics, timing }: &EpochReport) -> anyhow::Result<()> {
-        counter!("popgym_learner_epochs_total").absolute(metrics.epoch + 1);
+        // Not the run's totals: one that goes on from a checkpoint falls back, and would count twice what it does again.
+        counter!("popgym_learner_epochs_total").increment(1);
         gauge!("popgym_learner_weights_version").set((metrics.epoch + 1) as f64);
-        counter!("popgym_learner_env_steps_total").absolute(metrics.env_steps);
-        counter!("popgym_learner_episodes_total").absolute(metrics.episodes);
+        counter!("popgym_learner_env_steps_total").increment(metrics.env_steps - self.env_steps);
+        counter!("popgym_learner_episodes_total").increment(metrics.episodes - self.episodes);
+        (self.env_steps, self.episodes) = (metrics.env_steps, metrics.episodes);
+        gauge!("popgym_learner_run_steps").set(metrics.env_steps as f64);
         counter!("popgym_learner_surplus_steps_total").increment(timing.surplus_steps);
         gauge!("popgym_learner_return_mean").set(metrics.mean_return);
         gauge!("popgym_learner_return_min").set(metrics.min_return);
@@ -176,11 +201,12 @@ mod tests {
         for line in [
             "popgym_learner_run_info{env=\"RepeatPreviousEasy\",memory=\"GRU\",preset=\"paper\",seed=\"0\"} 1",
             "# TYPE popgym_learner_env_steps_total counter",
-            "popgym_learner_env_steps_total 5000",
+            "popgym_learner_env_steps_total 2000",
+            "popgym_learner_run_steps 5000",
             "popgym_learner_complete 1",
-            "popgym_learner_epochs_total 5",
+            "popgym_learner_epochs_total 2",
             "popgym_learner_weights_version 5",
-            "popgym_learner_episodes_total 50",
+            "popgym_learner_episodes_total 20",
             "popgym_learner_surplus_steps_total 80",
             "popgym_learner_return_mean 0.5",
             "popgym_learner_return_mmer 0.5",
@@ -204,6 +230,6 @@ mod tests {
             names
         };
         assert_eq!(words("# HELP "), words("# TYPE "));
-        assert_eq!(words("# TYPE ").len(), 30);
+        assert_eq!(words("# TYPE ").len(), 31);
     }
 }

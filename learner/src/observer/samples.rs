@@ -14,6 +14,7 @@ pub(crate) fn start(dir: &Path, epoch: u64) -> RunStart {
         seed: 0,
         epoch,
         env_steps: 1000 * epoch,
+        episodes: 10 * epoch,
         total_steps: 10_000,
         mmer: (epoch > 0).then(|| report(epoch - 1).metrics.mmer),
     }

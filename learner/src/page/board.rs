@@ -158,7 +158,8 @@ impl Board {
         self.lock().run.as_ref().map(|run| run.dir.clone())
     }
 
-    pub(super) fn view(&self) -> View {
+    /// All of it; `files` are those of the run directory.
+    pub(super) fn view(&self, files: Vec<&'static str>) -> View {
         let contents = self.lock();
         let run = contents.run.as_ref();
         View {
@@ -169,7 +170,7 @@ impl Board {
             checkpoint: contents.checkpoint.map(|(epoch, at)| (epoch, at.elapsed().as_secs_f64())),
             ended: contents.end.as_ref().map(|summary| summary.stopped_by.clone()),
             actors: contents.roster.as_ref().map(|roster| roster.actors()).unwrap_or_default(),
-            files: run.map_or(Vec::new(), |run| super::files_in(&run.dir)),
+            files,
             run: run.map(|run| Run {
                 dir: run.dir.display().to_string(),
                 env: run.env.clone(),
@@ -259,7 +260,7 @@ mod tests {
             report.timing.steps_per_second = 500.0;
             board.epoch(&report).unwrap();
         }
-        let recent = board.view().recent.unwrap();
+        let recent = board.view(Vec::new()).recent.unwrap();
         assert_eq!((recent.epochs, recent.seconds), (20, 80.0));
         assert_eq!((recent.wait_seconds, recent.learn_seconds, recent.other_seconds), (20.0, 40.0, 20.0));
         assert!((recent.steps_per_second - 500.0).abs() < 1e-9);

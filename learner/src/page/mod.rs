@@ -28,9 +28,16 @@ pub fn router(board: Board) -> Router {
     let page = [(header::CONTENT_SECURITY_POLICY, POLICY)];
     Router::new()
         .route("/", get((page, Html(include_str!("page.html")))))
-        .route("/run.json", get(|State(board): State<Board>| async move { Json(board.view()) }))
+        .route("/run.json", get(data))
         .route("/files/{name}", get(file))
         .with_state(board)
+}
+
+async fn data(State(board): State<Board>) -> Response {
+    // A disk that hangs must not keep the port from all else.
+    let dir = board.dir();
+    let files = tokio::task::spawn_blocking(move || dir.map_or(Vec::new(), |dir| files_in(&dir)));
+    Json(board.view(files.await.unwrap_or_default())).into_response()
 }
 
 /// Those of [`FILES`] that there are.
@@ -44,7 +51,7 @@ async fn file(State(board): State<Board>, Name(name): Name<String>, request: Req
         return (StatusCode::NOT_FOUND, format!("no such file; there are {}\n", FILES.join(", "))).into_response();
     };
     match ServeFile::new(dir.join(file)).try_call(request).await {
-        Ok(response) => response.into_response(),
+        Ok(response) => ([(header::X_CONTENT_TYPE_OPTIONS, "nosniff")], response).into_response(),
         Err(error) => (StatusCode::INTERNAL_SERVER_ERROR, format!("{file}: {error}\n")).into_response(),
     }
 }

@@ -2,7 +2,7 @@
 
 use std::collections::VecDeque;
 use std::fs::{self, File};
-use std::net::SocketAddr;
+use std::net::{SocketAddr, TcpListener};
 use std::os::unix::process::CommandExt as _;
 use std::path::Path;
 use std::process::{Child, Command, ExitStatus, Stdio};
@@ -128,9 +128,7 @@ impl<'a> Runner<'a> {
             let Some(child) = &mut running.child else {
                 if !self.dir.is_occupied(running.trial) {
                     running.said_before = fs::metadata(self.dir.log(running.trial)).map_or(0, |log| log.len());
-                    let metrics =
-                        self.metrics.map(|first| SocketAddr::new(first.ip(), first.port() + running.place as u16));
-                    running.child = Some(start(self.dir, running.trial, metrics)?);
+                    running.child = Some(start(self.dir, running.trial, self.metrics_address(&running))?);
                 }
                 self.running.push(running);
                 continue;
@@ -141,6 +139,17 @@ impl<'a> Runner<'a> {
             }
         }
         Ok(())
+    }
+
+    /// Where a trial serves its metrics. Nowhere, if somebody else is there: that is no reason for it to fail.
+    fn metrics_address(&self, running: &Running<'_>) -> Option<SocketAddr> {
+        let first = self.metrics?;
+        let address = SocketAddr::new(first.ip(), first.port() + running.place as u16);
+        let free = TcpListener::bind(address);
+        if let Err(error) = &free {
+            warn!("{}: no metrics at {address}: {error}", running.trial.name);
+        }
+        free.is_ok().then_some(address)
     }
 
     fn ended(&mut self, running: &Running<'a>, status: ExitStatus) -> anyhow::Result<()> {
