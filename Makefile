@@ -79,7 +79,7 @@ up: ## a learner and actors in containers, Prometheus and Grafana if they can be
 	@deploy/compose.sh up --detach --build
 	@for service in prometheus grafana; do \
 		deploy/compose.sh up --detach "$$service" || \
-			echo "without $$service: its image cannot be had (deploy/.env may name another)"; \
+			echo "without $$service: see above; deploy/.env may name another image or address"; \
 	done
 
 logs: ## what the containers say

@@ -29,11 +29,13 @@ done
 
 umask 077
 mkdir -p "$dir"
+# The system's own configuration may add what is said here a second time (OpenSSL 1.1).
+request() { openssl req -config <(printf '[req]\ndistinguished_name = name\n[name]\n') -new "$@"; }
 new_key() { openssl ecparam -name prime256v1 -genkey -noout | openssl pkcs8 -topk8 -nocrypt -out "$1"; }
 
 if [[ ! -e $dir/ca.pem ]]; then
     new_key "$dir/ca.key"
-    openssl req -x509 -new -key "$dir/ca.key" -days "$((days * 10))" -subj "/CN=popgym-rs cluster" \
+    request -x509 -key "$dir/ca.key" -days "$((days * 10))" -subj "/CN=popgym-rs cluster" \
         -addext basicConstraints=critical,CA:TRUE -addext keyUsage=critical,keyCertSign,cRLSign -out "$dir/ca.pem"
     echo "made $dir/ca.pem"
 fi
@@ -41,7 +43,7 @@ fi
 issue() { # issue NAME EXTENSIONS
     [[ ! -e $dir/$1.pem ]] || return 0
     new_key "$dir/$1.key"
-    openssl req -new -key "$dir/$1.key" -subj "/CN=popgym-rs $1" |
+    request -key "$dir/$1.key" -subj "/CN=popgym-rs $1" |
         openssl x509 -req -CA "$dir/ca.pem" -CAkey "$dir/ca.key" -CAcreateserial -days "$days" -out "$dir/$1.pem" \
             -extfile <(printf 'basicConstraints=critical,CA:FALSE\nkeyUsage=critical,digitalSignature\n%s\n' "$2") 2>/dev/null
     echo "made $dir/$1.pem"

@@ -24,11 +24,12 @@ setting() { # setting NAME DEFAULT
     local line
     line=$(grep -E "^$1=" "$here/.env" | tail -n 1 || true)
     line=${line#*=}
+    [[ $line != [\"\']*[\"\'] ]] || line=${line:1:-1}
     printf '%s' "${!1-${line:-$2}}"
 }
 
 make_secrets() {
-    local dir file hosts
+    local dir file hosts host kind
     dir=$(setting POPGYM_SECRETS ./secrets)
     [[ $dir == /* ]] || dir=$here/${dir#./}
     read -r -a hosts <<<"$(setting POPGYM_HOSTS '')"
@@ -40,7 +41,13 @@ make_secrets() {
     done
     for file in learner actor; do
         openssl x509 -in "$dir/$file.pem" -noout -checkend 0 >/dev/null ||
-            fail "$dir/$file.pem has expired: remove it and $dir/$file.key, and run this again"
+            fail "$dir/$file.pem has expired: remove it and $dir/$file.key, run this again, and then: deploy/compose.sh restart"
+    done
+    for host in ${hosts[@]+"${hosts[@]}"}; do
+        kind=-checkhost
+        [[ ! ($host =~ ^[0-9.]+$ || $host == *:*) ]] || kind=-checkip
+        openssl x509 -in "$dir/learner.pem" -noout "$kind" "$host" | grep -q 'does match' ||
+            fail "$dir/learner.pem is not for $host: remove it and $dir/learner.key, run this again, and then: deploy/compose.sh restart"
     done
 }
 

@@ -27,6 +27,15 @@ number() {
 # epochs FILE...: rows below the heads of these files, which are metrics.csv; none where there is no file.
 epochs() { { tail -q -n +2 -- "$@" 2>/dev/null || true; } | wc -l; }
 
+# saved DIR...: epochs of the newest checkpoint in these run directories; 0 where there is none. What metrics.csv has beyond it is
+# done again.
+saved() {
+    local dir
+    for dir in "$@"; do
+        ls -- "$dir/checkpoints" 2>/dev/null || true
+    done | sed -n 's/^epoch-0*\([0-9][0-9]*\)$/\1/p' | sort -n | tail -n 1 | grep . || echo 0
+}
+
 child= # the process that this job is about
 told=  # why it was told to end
 
@@ -72,8 +81,8 @@ queue_again() {
     scontrol requeue "$job"
 }
 
-# go_on_later EPOCHS FILE...: gives the nodes back and queues the job again, unless it was cancelled, or has got no further
-# than to as many epochs: then it would do so for ever. Exits, with status 0 where the job goes on.
+# go_on_later EPOCHS DIR...: gives the nodes back and queues the job again, unless it was cancelled, or has saved no more than
+# as many epochs: then it would do so for ever. Exits, with status 0 where the job goes on.
 go_on_later() {
     local before=$1
     shift
@@ -81,7 +90,7 @@ go_on_later() {
         say "ended by Slurm ($told); the same command goes on from the checkpoint"
         exit 143
     fi
-    (($(epochs "$@") > before)) ||
+    (($(saved "$@") > before)) ||
         fail 1 "no epoch was completed since this job started ($told): not queued again. Is the time limit shorter than an epoch, or does no actor work?"
     say "queueing the job again: it goes on from the checkpoint"
     queue_again ||

@@ -38,7 +38,7 @@ fn open_cuda_library() -> Result<(), String> {
             // own, of the version that this program is linked to, and it is never closed.
             let opened = unsafe { Library::open(Some("libtorch_cuda.so"), RTLD_NOW | RTLD_GLOBAL) };
             opened.map(std::mem::forget).map_err(|error| {
-                format!("the CUDA half of libtorch cannot be opened ({error}); `make setup` fetches it on a machine with an NVIDIA driver")
+                format!("the CUDA half of libtorch cannot be opened ({error}); `make setup` fetches it on a machine with an NVIDIA driver, POPGYM_TORCH=cuda make setup on any")
             })
         })
         .clone()

@@ -60,10 +60,10 @@ fn lives(objects: &[Value]) -> Vec<String> {
         let restarts = spec["failurePolicy"]["maxRestarts"] != 0
             || rules.iter().any(|rule| text(&rule["action"]).starts_with("Restart"));
         expect(!restarts, "a failure restarts the set");
-        expect(actor.spec["backoffLimit"] == i32::MAX, "the actors' job can fail");
-        let ends = ["podFailurePolicy", "activeDeadlineSeconds", "backoffLimitPerIndex", "maxFailedIndexes"];
+        expect(actor.spec["backoffLimitPerIndex"] == i32::MAX, "the actors' job can fail");
+        let ends = ["podFailurePolicy", "activeDeadlineSeconds", "backoffLimit", "maxFailedIndexes"];
         expect(ends.iter().all(|end| actor.spec[end].is_null()), "the actors' job can fail");
-        expect(actor.pod["restartPolicy"] == "OnFailure", "an actor is not started again");
+        expect(actor.pod["restartPolicy"] == "Never", "the schedule of one actor's restarts is that of all");
         expect(actor.spec["completions"] == actor.spec["parallelism"], "the number of actors cannot change");
         let one = learner.spec["completions"] == 1 && learner.spec["parallelism"] == 1;
         expect(one && learner.spec["podReplacementPolicy"] == "Failed", "there can be two learners");
@@ -397,9 +397,10 @@ fn whatever_would_break_a_run_is_seen() {
         ("template/metadata/labels/app.kubernetes.io~1component", json!("trainer"), "not the learner's"),
     ];
     let actor = [
+        ("backoffLimitPerIndex", json!(6), "actors' job can fail"),
         ("backoffLimit", json!(6), "actors' job can fail"),
         ("activeDeadlineSeconds", json!(3600), "actors' job can fail"),
-        ("template/spec/restartPolicy", json!("Never"), "not started again"),
+        ("template/spec/restartPolicy", json!("OnFailure"), "that of all"),
         ("completions", json!(8), "number of actors"),
         ("template/spec/containers/0/args/0", json!("--learner=https://learner:50051"), "do not go to the service"),
     ];

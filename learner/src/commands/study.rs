@@ -11,7 +11,7 @@ use serde_json::json;
 use super::{Failure, Outcome, say};
 use crate::Extensions;
 use crate::interrupt::{EXIT_INTERRUPTED, Interrupt};
-use crate::study::dir::{Standing, StudyDir};
+use crate::study::dir::{AnotherStudy, Standing, StudyDir};
 use crate::study::plan::{self, Trial};
 use crate::study::runner::{Runner, Tally};
 
@@ -91,7 +91,8 @@ pub fn study_run(args: &StudyRunArgs, extensions: &Extensions) -> Outcome {
     let jobs = args.jobs.map_or(cores, |jobs| jobs as usize).min(wanted.len());
     let metrics = args.metrics_listen.as_deref().map(|address| metrics_addresses(address, jobs)).transpose();
     let metrics = metrics.map_err(Failure::Usage)?;
-    let dir = StudyDir::open(&args.out, &text, &trials, extensions).map_err(Failure::Usage)?;
+    let dir = StudyDir::open(&args.out, &text, &trials, extensions)
+        .map_err(|error| if error.is::<AnotherStudy>() { Failure::Usage(error) } else { Failure::Run(error) })?;
     if args.retry_failed {
         wanted.iter().try_for_each(|trial| dir.forget_failures(trial))?;
     }
@@ -108,7 +109,7 @@ fn metrics_addresses(text: &str, jobs: usize) -> anyhow::Result<SocketAddr> {
     let first = metrics_address(text).map_err(anyhow::Error::msg)?;
     let last = usize::from(first.port()) + jobs.saturating_sub(1);
     anyhow::ensure!(
-        first.port() != 0 && last <= usize::from(u16::MAX),
+        first.port() != 0 && u16::try_from(last).is_ok(),
         "--metrics-listen is `{text}`, allowed is a port of 1 to 65535 with room above it for {jobs} trials at a time"
     );
     Ok(first)

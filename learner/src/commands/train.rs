@@ -21,6 +21,9 @@ use crate::run_dir::{self, RunDir};
 use crate::session::Session;
 use crate::trainer::Trainer;
 
+/// There where an NVIDIA driver is loaded.
+const NVIDIA_DRIVER: &str = "/proc/driver/nvidia/version";
+
 /// How long the actors of a run that was complete before may take to hear of it: more than their start does.
 const LATECOMERS: Duration = Duration::from_secs(10);
 
@@ -87,6 +90,12 @@ fn configure(args: &TrainArgs, extensions: &Extensions) -> anyhow::Result<Config
 /// Replaces `auto` by the device it means here.
 fn resolve_device(config: &mut Config) -> anyhow::Result<()> {
     let device = popgym_models::device::parse(&config.device)?;
+    if config.device == "auto" && device == Device::Cpu && Path::new(NVIDIA_DRIVER).exists() {
+        // Asked for, it says why it cannot be had.
+        if let Err(reason) = popgym_models::device::parse("cuda") {
+            tracing::warn!("training on the CPU, though there is an NVIDIA driver: {reason}");
+        }
+    }
     if device == Device::Cpu { "cpu" } else { "cuda" }.clone_into(&mut config.device);
     Ok(())
 }

@@ -13,7 +13,7 @@ use std::fs::{self, File, TryLockError};
 use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 
-use anyhow::{Context as _, bail};
+use anyhow::Context as _;
 use serde::{Deserialize, Serialize};
 
 use super::plan::{self, Trial};
@@ -53,6 +53,11 @@ pub struct Failure {
     pub error: String,
 }
 
+/// A directory that holds another study, and in what it differs.
+#[derive(Debug, thiserror::Error)]
+#[error("{0} holds another study: {1} (trials may only be added at its end)")]
+pub struct AnotherStudy(String, String);
+
 /// The right to run a trial; it ends with this value, and with the process.
 #[derive(Debug)]
 pub struct Claim {
@@ -64,7 +69,7 @@ impl StudyDir {
     /// the study since are taken up, too.
     ///
     /// # Errors
-    /// It holds another study, or cannot be written.
+    /// It holds another study ([`AnotherStudy`]), or cannot be read or written.
     pub fn open(path: &Path, text: &str, trials: &[Trial], extensions: &Extensions) -> anyhow::Result<Self> {
         let dir = Self { path: path.to_owned() };
         fs::create_dir_all(dir.trials()).with_context(|| format!("cannot create {}", dir.trials().display()))?;
@@ -78,7 +83,7 @@ impl StudyDir {
             Ok(known) => {
                 let known = plan::parse(&known, extensions).with_context(|| file.display().to_string())?;
                 if let Some(difference) = plan::difference(&known, trials) {
-                    bail!("{} holds another study: {difference} (trials may only be added at its end)", path.display());
+                    return Err(AnotherStudy(path.display().to_string(), difference).into());
                 }
             }
             Err(error) if error.kind() == ErrorKind::NotFound => {}

@@ -114,7 +114,7 @@ impl<'a> Runner<'a> {
             Standing::Failed => self.tally.failed += 1,
             Standing::Begun | Standing::Fresh => {
                 let taken = |place: &usize| self.running.iter().any(|running| running.place == *place);
-                let place = (0..).find(|place| !taken(place)).unwrap_or_default();
+                let place = (0..=self.running.len()).find(|place| !taken(place)).unwrap_or_default();
                 self.running.push(Running { trial, place, child: None, said_before: 0, _claim: claim });
                 return Ok(true);
             }
