@@ -186,14 +186,17 @@ fn the_end_of_a_run_is_seen() {
     let scene = Scene::new();
     let metrics = net::free_address();
     let prometheus = Prometheus::start(&scene, &[("learner", &[&metrics]), ("actor", &[])]);
+    popgym_tests::until("a first scrape", || (prometheus.finite("up") == 1).then_some(()));
     scene.train("run", &["--metrics-listen", &metrics, "--steps", "40960"]).expect(0);
     for complete in ["popgym_learner_complete", "trial:popgym_learner_complete:max"] {
         popgym_tests::until(complete, || {
             (prometheus.finite(&format!("last_over_time({complete}[10m]) == 1")) == 1).then_some(())
         });
     }
-    // Rules that know a learner without an end would alert.
-    assert_eq!(prometheus.finite("ALERTS"), 0);
+    // Once it is seen to be gone: not even pending.
+    popgym_tests::until("no learner", || (prometheus.finite("popgym_learner_complete") == 0).then_some(()));
+    std::thread::sleep(Duration::from_secs(2));
+    assert_eq!(prometheus.finite("ALERTS{alertname='PopgymLearnerDown'}"), 0);
 }
 
 /// Runs promtool on files.

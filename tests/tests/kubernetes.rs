@@ -243,7 +243,7 @@ fn all_manifests_are_valid_and_of_one_piece() {
     for job in Job::all(&train).into_iter().chain(Job::all(&study)) {
         assert!(job.is_selected(&selector["matchLabels"]), "{}", job.name);
         assert_eq!(selector["matchExpressions"][0]["key"], "app.kubernetes.io/component");
-        assert!(list(&selector["matchExpressions"][0]["values"]).contains(&json!(job.name)));
+        assert!(list(&selector["matchExpressions"][0]["values"]).contains(&job.labels["app.kubernetes.io/component"]));
         assert!(job.port(text(&endpoints[0]["port"])).is_some(), "{}", job.name);
     }
 }

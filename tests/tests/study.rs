@@ -192,8 +192,8 @@ fn an_interrupted_study_saves_and_goes_on() {
     until("two trials", || (runs(&scene).len() >= 2).then_some(()));
     let first = "study/trials/0000-RepeatFirstEasy-mlp-seed3";
     scene.reached(&mut study, first, 3);
-    for (port, memory) in [(first_port, "MLP"), (second_port, "GRU")] {
-        let info = format!("popgym_learner_run_info{{env=\"RepeatFirstEasy\",memory=\"{memory}\"");
+    for (port, memory) in [(first_port, "mlp"), (second_port, "gru")] {
+        let info = format!("popgym_learner_run_info{{env=\"popgym-RepeatFirstEasy-v0\",memory=\"{memory}\"");
         net::get(&format!("127.0.0.1:{port}"), "/metrics", &[&info]);
     }
     study.signal(Signal::TERM);
