@@ -57,6 +57,7 @@ pub fn wait_for_scrape(interrupted: impl Fn() -> bool) {
     let Some((last, interval)) = last_scrape() else { return };
     let interval = if interval.is_zero() { SCRAPE_INTERVAL } else { interval.min(SCRAPE_INTERVAL) };
     let until = last + interval + SCRAPE_SLACK;
+    tracing::info!("waiting for one more scrape of the metrics");
     while Instant::now() < until && !interrupted() {
         std::thread::sleep(Duration::from_millis(100));
         if last_scrape().is_some_and(|(at, _)| at != last) {
