@@ -268,7 +268,7 @@ strike_learner() {
     kill -KILL "$(process "$learner" learner)"
     wait_for 120 "its restart" restarted "$learner" 1
     wait_for 120 "the return of its actors" learner_says popgym_learner_actors -eq $((actors + 1))
-    wait_for 120 "another checkpoint" learner_says popgym_learner_env_steps_total -gt 120000
+    wait_for 120 "another checkpoint" learner_says popgym_learner_env_steps_total -gt 20000
     began=$SECONDS
     compose stop learner >/dev/null 2>&1
     say "the learner is stopped, in $((SECONDS - began)) s"

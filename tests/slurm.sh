@@ -298,7 +298,7 @@ case_limit() {
     until_true "a learner that listens" test -e "$dir/runs/stuck.slurm/current"
     scancel --batch --signal=USR1 "$job"
     until_true "a job that failed" state_is "$job" FAILED
-    grep -q "error: no epoch was completed" "$dir/stuck.out" || fail "$(cat "$dir/stuck.out")"
+    grep -q "error: nothing was saved" "$dir/stuck.out" || fail "$(cat "$dir/stuck.out")"
     expect_no_secrets runs/stuck
 }
 # A job that is cancelled saves the run's state and is not queued again; the same command goes on.

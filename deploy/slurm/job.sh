@@ -91,7 +91,7 @@ go_on_later() {
         exit 143
     fi
     (($(saved "$@") > before)) ||
-        fail 1 "no epoch was completed since this job started ($told): not queued again. Is the time limit shorter than an epoch, or does no actor work?"
+        fail 1 "nothing was saved since this job started ($told): not queued again. Is the time limit shorter than an epoch, the disk full, or does no actor work?"
     say "queueing the job again: it goes on from the checkpoint"
     queue_again ||
         fail 1 "the job may not be queued again; the same command goes on from the checkpoint"

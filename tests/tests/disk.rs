@@ -29,9 +29,16 @@ fn limit_files(learner: &Process, bytes: Option<u64>) {
     prlimit(Some(pid), Resource::Fsize, Rlimit { current: bytes, maximum: None }).expect("limits of one's own process");
 }
 
+/// The run's checkpoints, without one that is being written just now.
+fn whole(scene: &Scene) -> Vec<String> {
+    let mut names = scene.checkpoints("run");
+    names.retain(|name| !name.ends_with(".tmp"));
+    names
+}
+
 /// More than a run's other files, less than its weights.
 fn fill(scene: &Scene, learner: &Process) {
-    let newest = scene.checkpoints("run").pop().expect("a checkpoint");
+    let newest = whole(scene).pop().expect("a checkpoint");
     let weights = fs::metadata(scene.path(&format!("run/checkpoints/{newest}/weights.safetensors")));
     limit_files(learner, Some(weights.expect("its weights").len() - 1));
 }
@@ -45,9 +52,7 @@ fn a_full_disk_costs_checkpoints_and_not_the_run() {
     fill(&scene, &learner);
     let error = learner.logged("not written");
     assert!(error.contains("ERROR") && error.contains("weights.safetensors"), "{error}");
-    let mut before = scene.checkpoints("run");
-    // What an attempt is at just now.
-    before.retain(|name| !name.ends_with(".tmp"));
+    let before = whole(&scene);
     net::get(&metrics, "/metrics", &[&format!("{FAILURES} 1")]);
     let rows = scene.rows("run");
     scene.reached(&mut learner, "run", rows + 4);
@@ -58,7 +63,7 @@ fn a_full_disk_costs_checkpoints_and_not_the_run() {
     limit_files(&learner, None);
     let rows = scene.rows("run");
     scene.reached(&mut learner, "run", rows + 4);
-    assert_ne!(scene.checkpoints("run"), before);
+    assert_ne!(whole(&scene), before);
     learner.expect(0);
     assert_eq!(scene.accounted("run"), undisturbed());
 }

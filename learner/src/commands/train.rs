@@ -126,7 +126,9 @@ fn carry_out(
     if run_dir::finished(dir.path(), config).is_some() {
         say(&format!("already complete: {}", dir.path().join(SummaryJson::FILE).display()))?;
         if config.service.actors == 0 {
-            tell_latecomers(dir, session, interrupt)?;
+            if let Err(error) = tell_latecomers(dir, session, interrupt) {
+                tracing::warn!("actors that come now are not told: {error:#}");
+            }
         }
         return Ok(0);
     }

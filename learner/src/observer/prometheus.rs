@@ -13,6 +13,8 @@ use super::{EpochReport, Observer, RunStart, Summary};
 pub struct Prometheus {
     /// The run directory.
     dir: PathBuf,
+    /// What run it is.
+    labels: Vec<(&'static str, String)>,
     /// Steps and episodes of the run so far.
     env_steps: u64,
     episodes: u64,
@@ -105,16 +107,16 @@ impl Observer for Prometheus {
         checkpointed();
         counter!("popgym_learner_nonfinite_updates_total").increment(0);
         counter!("popgym_learner_checkpoint_failures_total").increment(0);
-        gauge!(
-            "popgym_learner_run_info",
-            "env" => start.env.clone(),
-            "memory" => start.memory.clone(),
-            "preset" => start.preset.clone(),
-            "seed" => start.seed.to_string(),
-        )
-        .set(1.0);
+        self.labels = vec![
+            ("env", start.env.clone()),
+            ("memory", start.memory.clone()),
+            ("preset", start.preset.clone()),
+            ("seed", start.seed.to_string()),
+        ];
+        gauge!("popgym_learner_run_info", &self.labels).set(1.0);
+        // With labels of its own: it is asked for when its program is gone, and another run may be at its address.
+        gauge!("popgym_learner_complete", &self.labels).set(0.0);
         gauge!("popgym_learner_target_steps").set(start.total_steps as f64);
-        gauge!("popgym_learner_complete").set(0.0);
         counter!("popgym_learner_epochs_total").increment(0);
         counter!("popgym_learner_env_steps_total").increment(0);
         counter!("popgym_learner_episodes_total").increment(0);
@@ -164,7 +166,7 @@ impl Observer for Prometheus {
     }
 
     fn run_end(&mut self, summary: &Summary) -> anyhow::Result<()> {
-        gauge!("popgym_learner_complete").set(f64::from(u8::from(summary.is_complete())));
+        gauge!("popgym_learner_complete", &self.labels).set(f64::from(u8::from(summary.is_complete())));
         Ok(())
     }
 }
@@ -203,7 +205,7 @@ mod tests {
             "# TYPE popgym_learner_env_steps_total counter",
             "popgym_learner_env_steps_total 2000",
             "popgym_learner_run_steps 5000",
-            "popgym_learner_complete 1",
+            "popgym_learner_complete{env=\"RepeatPreviousEasy\",memory=\"GRU\",preset=\"paper\",seed=\"0\"} 1",
             "popgym_learner_epochs_total 2",
             "popgym_learner_weights_version 5",
             "popgym_learner_episodes_total 20",

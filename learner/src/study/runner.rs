@@ -179,15 +179,20 @@ impl<'a> Runner<'a> {
 
     /// Lets the children save what they have and end.
     fn stop(&mut self) {
-        self.tally.left = self.queue.len() + self.running.len();
-        let mut children: Vec<Child> = self.running.drain(..).filter_map(|running| running.child).collect();
-        for child in &mut children {
+        for child in self.running.iter_mut().filter_map(|running| running.child.as_mut()) {
             drop(child.stdin.take());
         }
-        for mut child in children {
-            // An error means that there is no such process to wait for.
-            let _ = child.wait();
+        for Running { trial, child, .. } in &mut self.running {
+            if let Some(child) = child {
+                // An error means that there is no such process to wait for.
+                let _ = child.wait();
+            }
+            // It may have been waiting for no more than a last look at its metrics.
+            let done = self.dir.standing(trial) == Standing::Done;
+            *if done { &mut self.tally.done } else { &mut self.tally.left } += 1;
         }
+        self.running.clear();
+        self.tally.left += self.queue.len();
     }
 }
 
