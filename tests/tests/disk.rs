@@ -32,7 +32,7 @@ fn limit_files(learner: &Process, bytes: Option<u64>) {
 /// The run's checkpoints, without one that is being written just now.
 fn whole(scene: &Scene) -> Vec<String> {
     let mut names = scene.checkpoints("run");
-    names.retain(|name| !name.ends_with(".tmp"));
+    names.retain(|name| !name.contains(".tmp"));
     names
 }
 
