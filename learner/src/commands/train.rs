@@ -125,10 +125,10 @@ fn carry_out(
 ) -> Outcome {
     if run_dir::finished(dir.path(), config).is_some() {
         say(&format!("already complete: {}", dir.path().join(SummaryJson::FILE).display()))?;
-        if config.service.actors == 0 {
-            if let Err(error) = tell_latecomers(dir, session, interrupt) {
-                tracing::warn!("actors that come now are not told: {error:#}");
-            }
+        if config.service.actors == 0
+            && let Err(error) = tell_latecomers(dir, session, interrupt)
+        {
+            tracing::warn!("actors that come now are not told: {error:#}");
         }
         return Ok(0);
     }
