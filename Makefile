@@ -15,7 +15,7 @@ SECONDS_EACH ?= 1800
 # Another libtorch of the user's would be compiled against but not found at run time.
 unexport LIBTORCH LIBTORCH_INCLUDE LIBTORCH_LIB LIBTORCH_STATIC LIBTORCH_USE_PYTORCH
 
-.PHONY: help setup build train test soak slurm containers lint bench fuzz up down logs clean
+.PHONY: help setup build train test soak slurm containers kubernetes lint bench fuzz up down logs clean
 
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "make %-10s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -48,6 +48,9 @@ slurm: setup ## deploy/slurm on a real Slurm, where Debian's slurmctld, slurmd, 
 
 containers: setup ## deploy/compose.yaml in a Docker engine, with images built on bases that are made for it
 	POPGYM_CONTAINERS=1 $(CARGO) test $(CARGO_FLAGS) --workspace --test containers -- --nocapture
+
+kubernetes: ## deploy/kubernetes on the cluster of kubectl's context; LEARNER_IMAGE and ACTOR_IMAGE name images that it can pull
+	@LEARNER_IMAGE="$(LEARNER_IMAGE)" ACTOR_IMAGE="$(ACTOR_IMAGE)" tests/kubernetes.sh
 
 lint: setup ## formatting, clippy, and licences and advisories where cargo-deny is installed
 	$(CARGO) fmt --all --check

@@ -317,7 +317,7 @@ main() {
     of_run "${project}_runs" first/metrics.csv >"$work/metrics.csv"
     cmp "$work/expected.csv" "$work/metrics.csv" || fail "the curve is not that of the undisturbed run"
     say "the same curve, $(wc -l <"$work/metrics.csv") lines"
-    of_run "${project}_runs" first/events.jsonl | resumed || fail "not each new learner has gone on from a checkpoint"
+    of_run "${project}_runs" first/events.jsonl | python3 tests/resumed.py 3 || fail "not each new learner has gone on from a checkpoint"
     asked 'count(count_over_time(popgym_learner_return_mean[1h]) > 5)' -ge 1 || fail "Prometheus has no curve"
     asked 'max(max_over_time(popgym_learner_env_steps_total[1h]))' -gt 20000 || fail "Prometheus has not seen the run"
 
@@ -326,21 +326,6 @@ main() {
     [[ -z $(docker ps --all --quiet --filter "label=com.docker.compose.project=$project") ]] || fail "containers are left"
     docker volume inspect "${project}_runs" >/dev/null || fail "the run is gone"
     say "all of it holds"
-}
-
-# Whether the learner started three times, and every time but the first with a later epoch than the time before.
-resumed() {
-    python3 -c '
-import json, sys
-epochs = []
-for event in map(json.loads, sys.stdin):
-    if event["event"] == "started":
-        epochs.append(None)
-    elif event["event"] == "opened" and epochs[-1] is None:
-        epochs[-1] = event["epoch"]
-print("==> learners began with the epochs", *epochs)
-sys.exit(epochs[0] != 0 or len(epochs) != 3 or not 0 < epochs[1] < epochs[2])
-'
 }
 
 free_addresses() { # free_addresses N

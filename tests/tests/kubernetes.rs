@@ -1,5 +1,5 @@
 //! The manifests of deploy/kubernetes: valid by the published schemas, of one piece, and such that the programs do what
-//! they say. There is no cluster here; what a cluster makes of them is tested nowhere.
+//! they say. What a cluster makes of them is the business of `tests/kubernetes.sh` (`make kubernetes`).
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
@@ -22,7 +22,10 @@ fn render(directory: &str) -> Vec<Value> {
     kustomize::render(&home().join(directory)).unwrap()
 }
 
-/// A copy of deploy/kubernetes with the directory that the README shows how to make.
+/// What the README shows how to make of which directory.
+const OWN: [(&str, &str); 2] = [("my-run", "train"), ("my-study", "study")];
+
+/// A copy of deploy/kubernetes with that.
 fn with_the_readmes_own() -> tempfile::TempDir {
     let copy = tempfile::tempdir().unwrap();
     let status = Command::new("cp").arg("-r").arg(home()).arg(copy.path()).status().unwrap();
@@ -234,9 +237,11 @@ fn all_manifests_are_valid_and_of_one_piece() {
         assert_eq!(problems(&objects), none, "{directory}");
     }
     let copy = with_the_readmes_own();
-    let own = kustomize::render(&copy.path().join("kubernetes/my-run")).unwrap();
-    assert_eq!(problems(&own), none, "the README's");
-    assert_ne!(own, render("train"), "the README's");
+    for (own, directory) in OWN {
+        let objects = kustomize::render(&copy.path().join("kubernetes").join(own)).unwrap();
+        assert_eq!(problems(&objects), none, "{own}");
+        assert_ne!(objects, render(directory), "{own}");
+    }
     // The monitor sees the programs of a run, and trials.
     let (train, study, monitoring) = (render("train"), render("study"), render("monitoring"));
     let (selector, endpoints) = (&monitoring[0]["spec"]["selector"], &monitoring[0]["spec"]["podMetricsEndpoints"]);
@@ -276,7 +281,7 @@ fn kubectl_renders_the_same() {
     }
     let copy = with_the_readmes_own();
     let home = copy.path().join("kubernetes");
-    for directory in DIRECTORIES.iter().chain(&["my-run"]) {
+    for directory in DIRECTORIES.into_iter().chain(OWN.map(|(own, _)| own)) {
         let output = Command::new("kubectl").arg("kustomize").arg(home.join(directory)).output().unwrap();
         assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
         let file = copy.path().join("rendered.yaml");
