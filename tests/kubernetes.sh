@@ -29,7 +29,7 @@ check() {
     [[ -n ${LEARNER_IMAGE:-} && -n ${ACTOR_IMAGE:-} ]] ||
         fail "LEARNER_IMAGE is '${LEARNER_IMAGE:-}' and ACTOR_IMAGE is '${ACTOR_IMAGE:-}': images that the cluster can pull, with tags"
     kubectl version >/dev/null 2>&1 || fail "no cluster answers"
-    kubectl get jobsets --all-namespaces >/dev/null || fail "the cluster has no JobSet"
+    kubectl api-resources --api-group jobset.x-k8s.io | grep -q JobSet || fail "the cluster has no JobSet"
     say "$(kubectl config current-context): $(kubectl version 2>/dev/null | grep Server), $(kubectl get nodes --no-headers | wc -l) nodes"
 }
 
