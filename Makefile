@@ -50,7 +50,7 @@ containers: setup ## deploy/compose.yaml in a Docker engine, with images built o
 	POPGYM_CONTAINERS=1 $(CARGO) test $(CARGO_FLAGS) --workspace --test containers -- --nocapture
 
 kubernetes: ## deploy/kubernetes on the cluster of kubectl's context; LEARNER_IMAGE and ACTOR_IMAGE name images that it can pull
-	@LEARNER_IMAGE="$(LEARNER_IMAGE)" ACTOR_IMAGE="$(ACTOR_IMAGE)" tests/kubernetes.sh
+	@tests/kubernetes.sh
 
 lint: setup ## formatting, clippy, and licences and advisories where cargo-deny is installed
 	$(CARGO) fmt --all --check

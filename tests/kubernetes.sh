@@ -4,8 +4,9 @@
 #
 #   LEARNER_IMAGE=... ACTOR_IMAGE=... tests/kubernetes.sh
 #
-# The images are what the cluster calls them, tags included. It needs JobSet, a default StorageClass that has ReadWriteMany (for
-# the study), and 4 GiB of memory. Namespaces named popgym-test-* are made, and removed when all of it holds.
+# The images are what the cluster calls them, tags included. It needs JobSet, nodes with CPUs of one kind (curves are those of a kind),
+# a default StorageClass that has ReadWriteMany (for the study), and 4 GiB of memory. Namespaces named popgym-test-* are made; what has
+# not failed is removed.
 set -euo pipefail
 root=$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd)
 
@@ -22,14 +23,16 @@ fail() {
 }
 
 check() {
-    local program
+    local program image value
     for program in kubectl openssl python3; do
         command -v "$program" >/dev/null || fail "$program is not installed"
     done
-    [[ -n ${LEARNER_IMAGE:-} && -n ${ACTOR_IMAGE:-} ]] ||
-        fail "LEARNER_IMAGE is '${LEARNER_IMAGE:-}' and ACTOR_IMAGE is '${ACTOR_IMAGE:-}': images that the cluster can pull, with tags"
+    for image in LEARNER_IMAGE ACTOR_IMAGE; do
+        value=${!image:-}
+        [[ ${value##*/} == ?*:?* ]] || fail "$image is '$value', allowed is an image that the cluster can pull, with its tag"
+    done
     kubectl version >/dev/null 2>&1 || fail "no cluster answers"
-    kubectl api-resources --api-group jobset.x-k8s.io | grep -q JobSet || fail "the cluster has no JobSet"
+    kubectl get --raw /apis/jobset.x-k8s.io/v1alpha2 >/dev/null || fail "the cluster has no JobSet"
     say "$(kubectl config current-context): $(kubectl version 2>/dev/null | grep Server), $(kubectl get nodes --no-headers | wc -l) nodes"
 }
 
@@ -49,8 +52,11 @@ k() { kubectl --namespace "$space" "$@"; }
 
 # The README's block that has this text, for the namespace at hand.
 block() { # block TEXT
-    awk -v text="$1" '/^```/ { inside = !inside; if (!inside) { if (index(block, text)) { printf "%s", block; exit } block = "" } next }
-        inside { block = block $0 "\n" }' "$root/deploy/kubernetes/README.md" | here
+    local found
+    found=$(awk -v text="$1" '/^```/ { inside = !inside; if (!inside) { if (index(block, text)) { printf "%s", block; exit } block = "" } next }
+        inside { block = block $0 "\n" }' "$root/deploy/kubernetes/README.md")
+    [[ -n $found ]] || fail "README has no block with '$1'"
+    here <<<"$found"
 }
 line() { # line TEXT: the one line of all blocks that has it
     local found
@@ -58,8 +64,8 @@ line() { # line TEXT: the one line of all blocks that has it
     [[ $(wc -l <<<"$found") == 1 && -n $found ]] || fail "README has not one line with '$1'"
     here <<<"$found"
 }
-here() { sed "s|my-run|$space|g; s|my-study|$space|g"; }
-execute() { (cd "$work" && bash -euo pipefail) >>"$work/log" 2>&1 || { tail -n 30 "$work/log" >&2 && fail "a block of the README"; }; }
+here() { sed "s/my-run/$space/g; s/my-study/$space/g; s/-n monitoring/-n $space/"; }
+execute() { (cd "$work" && timeout 600 bash -euo pipefail) >>"$work/log" 2>&1 || { tail -n 30 "$work/log" >&2 && fail "a block of the README"; }; }
 
 # What is smaller here than in the README: the run, what its pods ask for, how many they are; and the images.
 overlay() { # overlay FILE TEXT KUSTOMIZATION...
@@ -71,7 +77,7 @@ path, learner, actor, *more = sys.argv[1:]
 text = open(path).read()
 for name, image in (("popgym-learner", learner), ("popgym-actor", actor)):
     repository, _, tag = image.rpartition(":")
-    text = re.sub(rf"newName: \S+/{name}\n", f"newName: {repository}\n    newTag: {tag}\n", text)
+    text = re.sub(rf"newName: \S+/{name}\n", f"newName: {repository}\n    newTag: '{tag}'\n", text)
 open(path, "w").write("\n".join([text.rstrip("\n"), *more, ""]))
 PYTHON
 }
@@ -111,7 +117,8 @@ one_ready() { [[ $(ready learner | grep -vxF "${1:-}" | wc -l) == 1 ]]; }
 # A pod's answer, through kubectl.
 get() { # get POD PORT PATH
     local forwarding port answer=1
-    k port-forward "pod/$1" ":$2" >"$work/forward" 2>&1 &
+    : >"$work/forward"
+    kubectl --namespace "$space" port-forward "pod/$1" ":$2" >>"$work/forward" 2>&1 &
     forwarding=$!
     for _ in {1..50}; do
         port=$(sed -n 's/^Forwarding from 127.0.0.1:\([0-9]*\) .*/\1/p' "$work/forward")
@@ -137,7 +144,11 @@ learner_says() { # learner_says METRIC OPERATOR NUMBER
     pod=$(ready learner)
     [[ -n $pod ]] && metric "$pod" 9100 "$@"
 }
-samples() { metric "$1" 9101 popgym_actor_steps_total -gt 0; }
+samples_of_index() {
+    local pod
+    pod=$(actor_of_index "$1")
+    [[ -n $pod ]] && metric "$(basename "$pod")" 9101 popgym_actor_steps_total -gt 0
+}
 
 # --------------------------------------------------------------------------------------------------------------------- strikes
 
@@ -148,23 +159,27 @@ JSON
 }
 
 actor_of_index() { k get pods --selector "app.kubernetes.io/component=actor,batch.kubernetes.io/job-completion-index=$1" --output name | tail -n 1; }
-another_actor() { [[ -n $(actor_of_index 0) && $(actor_of_index 0) != "$1" ]]; }
+another_actor() {
+    local actor
+    actor=$(actor_of_index 0)
+    [[ -n $actor && $actor != "$1" ]]
+}
 
 strike() {
     local learner actor began
     wait_for "a learner" one_ready
     learner=$(ready learner)
+    wait_for "its actors" learner_says popgym_learner_actors -eq "$actors"
     wait_for "a checkpoint" learner_says popgym_learner_env_steps_total -gt 60000
-    learner_says popgym_learner_actors -eq "$actors" || fail "the learner has not $actors actors"
 
     say "an actor is lost"
     actor=$(actor_of_index 0)
     k delete "$actor" --grace-period 0 --force >/dev/null 2>&1
     wait_for "another actor in its place" another_actor "$actor"
-    wait_for "the steps of that" samples "$(basename "$(actor_of_index 0)")"
+    wait_for "the steps of that" samples_of_index 0
 
     say "one more actor"
-    line '"completions":16' | sed "s/16/$((actors + 1))/g" | execute
+    line '"completions":16' | sed "s/:16/:$((actors + 1))/g" | execute
     began=$SECONDS
     wait_for "its steps" samples_of_index "$actors"
     say "its pod samples after $((SECONDS - began)) s"
@@ -175,16 +190,13 @@ strike() {
     wait_for "another learner" one_ready "$learner"
     wait_for "the return of its actors" learner_says popgym_learner_actors -eq $((actors + 1))
     learner=$(ready learner)
+    # What an epoch has learned is kept when it is complete.
+    wait_for "an epoch" learner_says popgym_learner_epochs_total -gt 0
 
     say "the learner is deleted"
     k delete pod "$learner" >/dev/null
     wait_for "another learner" one_ready "$learner"
     wait_for "the return of its actors" learner_says popgym_learner_actors -eq $((actors + 1))
-}
-samples_of_index() {
-    local pod
-    pod=$(actor_of_index "$1")
-    [[ -n $pod ]] && samples "$(basename "$pod")"
 }
 
 # ----------------------------------------------------------------------------------------------------------------------- steps
@@ -197,23 +209,25 @@ remove() {
 }
 
 fetch_run() { # fetch_run DEST
-    local kind
-    for kind in podmonitors prometheusrules; do
-        kubectl get "$kind" --all-namespaces >/dev/null 2>&1 || continue
-        case $kind in
-            podmonitors) line kubernetes/monitoring | execute ;;
-            prometheusrules) block PrometheusRule | execute ;;
-        esac
-        say "the cluster takes our $kind"
-    done
     mkdir -p "$work/runs"
     block popgym-files: | execute
     mv "$work/runs/$space" "$1"
 }
 
+monitor() {
+    if kubectl get --raw /apis/monitoring.coreos.com/v1 >/dev/null 2>&1; then
+        line kubernetes/monitoring | execute
+        block PrometheusRule | execute
+        say "the cluster takes monitor and rules"
+    else
+        say "skipped: monitor and rules (the cluster has no Prometheus Operator)"
+    fi
+}
+
 calm_run() {
     say "a run that nobody disturbs"
     start_run "$namespace-calm" "$configuration"
+    monitor
     wait_for "its end" set_is Completed
     fetch_run "$work/calm"
     remove
@@ -232,7 +246,10 @@ struck_run() {
     python3 "$root/tests/resumed.py" 3 <"$work/struck/events.jsonl" || fail "not each new learner has gone on from a checkpoint"
     remove
 }
-no_actors() { [[ -z $(ready actor) ]]; }
+no_actors() {
+    local actors
+    actors=$(ready actor) && [[ -z $actors ]]
+}
 
 wrong_run() {
     say "a run that cannot work"
