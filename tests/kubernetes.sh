@@ -247,8 +247,8 @@ struck_run() {
     remove
 }
 no_actors() {
-    local actors
-    actors=$(ready actor) && [[ -z $actors ]]
+    local left
+    left=$(ready actor) && [[ -z $left ]]
 }
 
 wrong_run() {
