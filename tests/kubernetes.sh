@@ -14,7 +14,7 @@ readonly namespace=popgym-test-$$ actors=2
 # Some minutes on two cores, a checkpoint every 5 of its 250 epochs.
 readonly configuration='env = "RepeatPreviousEasy"\nseed = 1\nsteps = 2_000_000\nthreads = 1\ncheckpoint_epochs = 5\n[memory]\nname = "mlp"'
 readonly study='[run]\nsteps = 50_000\nthreads = 1\n[[product]]\nenvs = ["RepeatFirst"]\nmemories = ["mlp"]\nseeds = [0]'
-work=
+work= space=default
 
 say() { printf '%s %s\n' "$(date +%T)" "$*"; }
 fail() {
