@@ -209,7 +209,6 @@ remove() {
 }
 
 fetch_run() { # fetch_run DEST
-    mkdir -p "$work/runs"
     block popgym-files: | execute
     mv "$work/runs/$space" "$1"
 }
@@ -274,7 +273,6 @@ study() {
     overlay study.toml "$study" "$(little Job /spec)"
     block 'study.toml <<' | grep ^kubectl | execute
     wait_for "its end" study_is_complete
-    mkdir -p "$work/runs"
     block popgym-studies | execute
     [[ $(ls "$work/runs/$space"/trials/*/summary.json | wc -l) == 3 ]] || fail "there are not 3 trials"
     remove
